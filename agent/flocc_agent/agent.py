@@ -1,10 +1,7 @@
 """`Agent`: one robot's agent, for the robot's own program. What it is made of stands in `composition.py`."""
 
 import asyncio
-import json
 import logging
-import os
-import signal
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
@@ -22,17 +19,16 @@ from flocc_agent.core.reports import Fact
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import inverse
 from flocc_agent.radio import Radio
-from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
 from flocc_agent.runtime.driver import Driver
 from flocc_agent.runtime.event_lines import Reported
-from flocc_agent.runtime.evidence import evidence_of
-from flocc_agent.runtime.facts import JourneyEnded, KilledByOrder
+from flocc_agent.runtime.facts import JourneyEnded
 from flocc_agent.runtime.given_keyframes import BadKeyframe as BadKeyframe
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
 from flocc_agent.runtime.network_watch import look_at_network, say_how_others_are_found
 from flocc_agent.runtime.new_journeys import began_anew, last_body, last_keyframe
+from flocc_agent.runtime.operator_answers import OperatorAnswers
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.pose_limits import MOUNT_MAX_M, PoseGate, pose_fault
 from flocc_agent.runtime.recording import Recording
@@ -43,7 +39,6 @@ from flocc_agent.runtime.unmeasured_steps import StepWatch
 from flocc_agent.runtime.workers import Workers
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId, LogId
-from flocc_protocol.keys import Admin
 
 if TYPE_CHECKING:
     from flocc_agent.runtime.ros2.adapter import Ros2Adapter
@@ -51,9 +46,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
-
-KILL_AFTER_S = 0.2
-"""Time for the answer to an operator's order to leave."""
 
 
 class JourneyError(FloccError):
@@ -449,9 +441,15 @@ class Agent:
         """Make everything that this agent is of, and keep what is reached later."""
         if self.config.ros2 is not None and self._ros2 is None:
             self._ros2 = self._adapter(self.config.ros2)
-        answers: dict[Admin, Callable[[bytes], bytes]] = {Admin.STATUS: self._answer_status}
-        if self.config.transport.chaos:
-            answers[Admin.CHAOS] = self._disturb
+        answers = OperatorAnswers(
+            self.config,
+            self._clock_s,
+            self._on_report,
+            self.status,
+            lambda: self._started,
+            lambda: self._radio,
+            self.set_slowness,
+        )
         sight = Sight(
             self._perception,
             self._camera,
@@ -463,40 +461,12 @@ class Agent:
             sight,
             self._clock_s,
             self._on_report,
-            answers,
+            answers.by_kind(),
             map_fixed=self._map_fixed,
             new_journey=self._new_journey,
         )
         self._store, self._workers, self._radio = parts.store, parts.workers, parts.radio
         return parts.driver
-
-    def _answer_status(self, _: bytes) -> bytes:
-        """Tell an operator the status, and what he may want to know of maps that have not merged."""
-        driver = self._started
-        merging = evidence_of(driver.robot, self.config.core, driver.solved)
-        if self._radio is not None:
-            merging = merging.model_copy(update={"emulated": self._radio.parameters.emulated()})
-        status = self.status().model_dump(mode="json")
-        return json.dumps(
-            {**status, "compute_class": self.config.compute_class, **merging.model_dump(mode="json")}
-        ).encode()
-
-    def _disturb(self, request: bytes) -> bytes:
-        """Carry out an operator's order, and say so."""
-        try:
-            order = read_order(request)
-        except BadOrder as error:
-            return str(error).encode()
-        if not order.concerns(self.config.name):
-            return b"not concerned"
-        if self._radio is not None:
-            self._radio.parameters = disturbed(self._radio.parameters, order, self._clock_s())
-        if order.kind == "slow" and order.value is not None:
-            self.set_slowness(order.value)
-        if order.kind == "kill":
-            self._on_report(Reported(self._clock_s(), self.config.name, KilledByOrder()))
-            asyncio.get_running_loop().call_later(KILL_AFTER_S, os.kill, os.getpid(), signal.SIGKILL)
-        return b"done"
 
     async def _play(self, recording: Recording) -> None:
         source = self.config.source

@@ -4,6 +4,8 @@ Poses are (4, 4) float64; `T_a_b` is the pose of frame b in frame a, so `p_a = T
 ordered as GTSAM's: rotation (rad), then translation (m).
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,11 +18,12 @@ SMALL_ANGLE_RAD = 1e-9
 SMALL_TWIST_RAD = 1e-5
 RIGID_TOLERANCE = 1e-3
 _UPPER = np.triu_indices(6)
+_IDENTITY = np.eye(4)
 
 
 def pose(R: Float, t: Float) -> Float:
     """Put a rotation (3, 3) and a translation (3,) into a (4, 4) pose."""
-    T = np.eye(4)
+    T = _IDENTITY.copy()
     T[:3, :3] = R
     T[:3, 3] = t
     return T
@@ -46,8 +49,8 @@ def is_rigid(T: Float, tolerance: float = RIGID_TOLERANCE) -> bool:
     if T.shape != (4, 4) or not np.all(np.isfinite(T)):
         return False
     R = T[:3, :3]
-    orthonormal = np.allclose(R @ R.T, np.eye(3), atol=tolerance) and np.linalg.det(R) > 0
-    return bool(orthonormal and np.allclose(T[3], [0, 0, 0, 1], atol=tolerance))
+    off = np.concatenate([np.abs(R @ R.T - _IDENTITY[:3, :3]).ravel(), np.abs(T[3] - _IDENTITY[3])])
+    return bool(off.max() <= tolerance and np.linalg.det(R) > 0)
 
 
 def nearest_rotation(M: Float) -> Float:
@@ -170,27 +173,20 @@ def angle_rad(R: Float) -> float:
 
 def q_wxyz_from_R(R: Float) -> Float:
     """Unit quaternion (4,), w first and not negative."""
-    m = np.asarray(R, dtype=float)
-    candidates = np.array(
-        [
-            1 + m[0, 0] + m[1, 1] + m[2, 2],
-            1 + m[0, 0] - m[1, 1] - m[2, 2],
-            1 - m[0, 0] + m[1, 1] - m[2, 2],
-            1 - m[0, 0] - m[1, 1] + m[2, 2],
-        ]
-    )
-    k = int(np.argmax(candidates))
-    s = 2.0 * np.sqrt(candidates[k])
+    (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = np.asarray(R, dtype=float).tolist()
+    candidates = (1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22)
+    k = candidates.index(max(candidates))
+    s = 2.0 * math.sqrt(candidates[k])
     if k == 0:
-        q = np.array([s / 4, (m[2, 1] - m[1, 2]) / s, (m[0, 2] - m[2, 0]) / s, (m[1, 0] - m[0, 1]) / s])
+        q = np.array([s / 4, (m21 - m12) / s, (m02 - m20) / s, (m10 - m01) / s])
     elif k == 1:
-        q = np.array([(m[2, 1] - m[1, 2]) / s, s / 4, (m[0, 1] + m[1, 0]) / s, (m[0, 2] + m[2, 0]) / s])
+        q = np.array([(m21 - m12) / s, s / 4, (m01 + m10) / s, (m02 + m20) / s])
     elif k == 2:
-        q = np.array([(m[0, 2] - m[2, 0]) / s, (m[0, 1] + m[1, 0]) / s, s / 4, (m[1, 2] + m[2, 1]) / s])
+        q = np.array([(m02 - m20) / s, (m01 + m10) / s, s / 4, (m12 + m21) / s])
     else:
-        q = np.array([(m[1, 0] - m[0, 1]) / s, (m[0, 2] + m[2, 0]) / s, (m[1, 2] + m[2, 1]) / s, s / 4])
+        q = np.array([(m10 - m01) / s, (m02 + m20) / s, (m12 + m21) / s, s / 4])
     q = q if q[0] >= 0 else -q
-    return np.asarray(q / np.linalg.norm(q))
+    return np.asarray(q / math.sqrt(q.dot(q)))
 
 
 def R_from_q_wxyz(q_wxyz: Float) -> Float:
@@ -199,10 +195,11 @@ def R_from_q_wxyz(q_wxyz: Float) -> Float:
     Raises:
         ValueError: The quaternion is zero or not finite.
     """
-    norm = float(np.linalg.norm(q_wxyz))
-    if not np.isfinite(norm) or norm < 1e-12:
+    q = np.asarray(q_wxyz, dtype=float)
+    norm = math.sqrt(q.dot(q))
+    if not math.isfinite(norm) or norm < 1e-12:
         raise ValueError(f"quaternion {q_wxyz} has no direction")
-    w, x, y, z = np.asarray(q_wxyz, dtype=float) / norm
+    w, x, y, z = (q / norm).tolist()
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -53,7 +53,7 @@ def gossip(dimension: int = 512) -> dict[str, Any]:
 
 def scale(robots: int, minutes: float, area_m: float = 120.0, closures_enough: int | None = None) -> dict[str, Any]:
     """A large swarm in a town, radio range 25 m: CPU time of the simulation on one core, bytes by kind, memory."""
-    scenario = _scenario(robots=robots, area_m=area_m, length_m=42.0 * minutes, range_m=25.0, distance_m=2.0)
+    scenario = town(robots, area_m, minutes)
     if closures_enough is not None:
         closing = replace(scenario.core.loop_closing, closures_enough=closures_enough)
         scenario = scenario.model_copy(update={"core": replace(scenario.core, loop_closing=closing)})
@@ -85,6 +85,13 @@ def scale(robots: int, minutes: float, area_m: float = 120.0, closures_enough: i
         "cpu_walks_s": round(drawn_s - began_s, 1),
         "cpu_s": round(done_s - drawn_s, 1),
     }
+
+
+def town(robots: int, area_m: float, minutes: float, seed: int = 3) -> Scenario:
+    """Robots that walk through a town of an edge of `area_m`, with a radio range of 25 m."""
+    scenario = _scenario(robots=robots, area_m=area_m, length_m=42.0 * minutes, range_m=25.0, distance_m=2.0)
+    assert scenario.tracks is not None
+    return scenario.model_copy(update={"tracks": scenario.tracks.model_copy(update={"seed": seed})})
 
 
 def twice(seeds: int) -> dict[str, Any]:

@@ -40,7 +40,7 @@ class CandidatePair(_PairFields):
         """
         if not low < high:
             raise ValueError("a candidate pair is sorted and joins two keyframes")
-        return super().__new__(cls, low, high)
+        return tuple.__new__(cls, (low, high))
 
     def other(self, end: KeyframeId) -> KeyframeId:
         """The end that is not the given one."""
@@ -49,7 +49,7 @@ class CandidatePair(_PairFields):
     @classmethod
     def of(cls, a: KeyframeId, b: KeyframeId) -> "CandidatePair":
         """Sort two keyframes into a pair."""
-        return cls(a, b) if a < b else cls(b, a)
+        return tuple.__new__(cls, (a, b)) if a < b else cls(b, a)
 
 
 PAIR = struct(CandidatePair, low=KEYFRAME_ID, high=KEYFRAME_ID)

@@ -58,7 +58,7 @@ class LogId(_LogFields):
         checked_name(robot)
         if not 0 <= incarnation <= INCARNATION_MAX:
             raise ValueError(f"incarnation {incarnation} is out of range")
-        return super().__new__(cls, robot, incarnation)
+        return tuple.__new__(cls, (robot, incarnation))
 
     def __str__(self) -> str:
         return self.robot if self.incarnation == 0 else f"{self.robot}~{self.incarnation:x}"
@@ -92,7 +92,7 @@ class KeyframeId(_KeyframeFields):
         """
         if not 0 <= index <= INDEX_MAX:
             raise ValueError(f"keyframe index {index} is out of range")
-        return super().__new__(cls, log, index)
+        return tuple.__new__(cls, (log, index))
 
     def __str__(self) -> str:
         return f"{self.log}/{self.index}"
@@ -126,7 +126,7 @@ class Term(_TermFields):
         """
         if not 0 <= counter <= TERM_COUNTER_MAX:
             raise ValueError(f"term counter {counter} is out of range")
-        return super().__new__(cls, counter, leader)
+        return tuple.__new__(cls, (counter, leader))
 
     def __str__(self) -> str:
         return f"{self.counter}:{self.leader}"

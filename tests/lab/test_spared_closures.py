@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
-from flocc_agent.core.spared import TIED_MIN
+from flocc_agent.core.spared import STRETCH, TIED_MIN
+from flocc_lab.bench.closure_density import kept_by_density
 from flocc_lab.bench.spared_closures import kept_of, of_scenario, walk_scenario
 from flocc_protocol.ids import KeyframeId, LogId
 
@@ -39,6 +40,19 @@ def test_closures_of_one_stretch_are_left_out_once_enough_agree() -> None:
 def test_where_closures_contradict_all_are_kept() -> None:
     graph = road(20.0)
     assert len(kept_of(graph)) == len(graph.closures)
+
+
+def test_a_bound_on_density_leaves_as_many_at_both_ends_of_what_it_leaves_out() -> None:
+    graph = road(0.0)
+    kept = kept_by_density(graph, 1.0)
+    assert kept_by_density(graph, 0.0) == []
+    assert kept_by_density(graph, 100.0) == list(range(len(graph.closures)))
+    assert 0 < len(kept) < len(graph.closures)
+    ends = [end for k in kept for end in (graph.closures[k].query, graph.closures[k].match)]
+    for k in set(range(len(graph.closures))) - set(kept):
+        for end in (graph.closures[k].query, graph.closures[k].match):
+            stretch = range(max(end.index - STRETCH, 0), min(end.index + STRETCH + 1, KEYFRAMES))
+            assert sum(each.log == end.log and each.index in stretch for each in ends) >= len(stretch)
 
 
 @pytest.mark.slow

@@ -10,8 +10,8 @@ import pytest
 from flocc_agent.config import ClassicalConfig
 from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.perception.classical.encoder import ClassicalEncoder, decode_features
+from flocc_lab.bench.drawn_overlays import KINDS, overlay
 from flocc_lab.bench.overlaid_recording import main, touched
-from flocc_lab.bench.overlays import KINDS, overlay
 from flocc_lab.bench.watched_cameras import CachedFeatures, Trouble, WatchedDrive, cell, counted, zoomed
 from flocc_lab.bench.watched_drives import drawn_town
 

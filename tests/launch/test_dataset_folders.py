@@ -820,3 +820,13 @@ def test_what_lies_beside_the_files_that_are_read_is_told(tmp_path: Path, caplog
     convert(path, tmp_path / "out", odometry=path / "given.tum")
     assert f"{path}: not used: calib.txt, extrinsics.txt" in caplog.text
     assert info(tmp_path / "out").notes == ()
+
+
+def test_a_trajectory_of_the_folder_that_is_named_again_is_told_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_plain(tmp_path / "p")
+    text = "# said by nobody\n" + (path / "groundtruth.tum").read_text()
+    (path / "odometry.tum").write_text(text)
+    convert(path, tmp_path / "out", odometry=path / "odometry.tum")
+    assert caplog.text.count("comments that were not used: 'said by nobody'") == 1

@@ -11,7 +11,7 @@ from tests.swarm.robots import RobotProcess, agent_configs, frames, leaders, log
 
 from flocc_launch.swarm.chaos_orders import disturb, parse_order
 
-pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.slow]
 
 NAMES = ("r1", "r2", "r3")
 LEADER_TIMEOUT_S = 3.0
@@ -32,6 +32,7 @@ async def running(folder: Path, **options: object) -> AsyncIterator[list[RobotPr
         await asyncio.gather(*(robot.close() for robot in robots))
 
 
+@pytest.mark.beside
 async def test_a_killed_leader_is_replaced_and_comes_back_with_its_log_and_all_end_in_order(tmp_path: Path) -> None:
     async with running(tmp_path) as robots:
         first, *rest = robots

@@ -22,6 +22,9 @@ DAMPING_FACTOR = 10.0
 LENGTHS = (1.0, 0.5, 0.25, 0.125, 0.0625)
 """Parts of a step that are tried before it is damped: they cost residuals, damping costs a linear system and holds back
 the softest motions most, which are those that long chains need."""
+CREEPING_RATIO = 1e-5
+"""Where two poses of a direction meet its cost has a kink at which damped steps creep: one that lowers the cost by less
+than this part is the last one."""
 VOTED_STEPS_MAX = 3
 """Linear systems that are solved to compare states by votes: they stand near their optimum."""
 
@@ -101,14 +104,14 @@ class Objective:
     def bounds(self) -> Float:
         """Squared residual (L,) below which a right closure lies with the configured probability.
 
-        A free scale takes one of the six degrees of freedom. Where closures have no unit the bound is sharp: wrong ones
-        bend lengths that nothing holds.
+        A free scale takes one of the six degrees of freedom. Of closures without a unit the bound is sharp: a wrong one
+        among them bends lengths that nothing holds.
         """
         config = self.config
         graduated = config.solver in (Solver.GNC_TLS, Solver.GNC_GM)
-        probability = config.kept_probability if graduated else config.inlier_probability
-        if self.has_directions:
-            probability = min(probability, config.inlier_probability)
+        kept = config.kept_probability if graduated else config.inlier_probability
+        without_unit = directions(self.edges)[self.closures]
+        probability = np.where(without_unit, min(kept, config.inlier_probability), kept)
         free = (self.edges.sigma[self.closures] > 0) | (self.edges.cluster[self.closures] >= 0)
         return np.asarray(chdtri(np.where(free, 5.0, 6.0), 1.0 - probability))
 
@@ -123,11 +126,17 @@ class Point:
 
 
 def descend(
-    objective: Objective, state: State, weights: Float, steps_max: int | None = None, hold: bool = False
+    objective: Objective,
+    state: State,
+    weights: Float,
+    steps_max: int | None = None,
+    hold: bool = False,
+    damping: float = 0.0,
 ) -> Solved:
-    """Go down for given weights until the cost rests, or so many linear systems are solved."""
+    """Go down for given weights until the cost rests, or so many linear systems are solved, the first one damped so."""
     budget = objective.config.iterations_max if steps_max is None else steps_max
-    here, damping, solves = _point(objective, state, weights, hold), 0.0, 0
+    here, solves = _point(objective, state, weights, hold), 0
+    kinked = hold and objective.has_directions
     while solves < budget:
         while True:
             solves += 1
@@ -140,7 +149,8 @@ def descend(
                 return Solved(here.state, weights, here.cost, solves, False)
             damping = max(damping * DAMPING_FACTOR, DAMPING_MIN)
         decrease, here = here.cost - there.cost, there
-        if _is_finished(objective.config, here.cost, decrease):
+        creeps = kinked and damping > 0.0 and decrease <= CREEPING_RATIO * here.cost
+        if creeps or _is_finished(objective.config, here.cost, decrease):
             return Solved(here.state, weights, here.cost, solves, True)
         damping = 0.0 if damping <= DAMPING_MIN else damping / DAMPING_FACTOR**2
     return Solved(here.state, weights, here.cost, solves, False)

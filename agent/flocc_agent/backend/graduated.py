@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend.descent import Objective, descend
+from flocc_agent.backend.descent import DAMPING_FACTOR, DAMPING_MIN, Objective, descend
 from flocc_agent.backend.edges import State
 from flocc_agent.config import BackendConfig, Solver
 
@@ -84,15 +84,23 @@ def _squared(objective: Objective, state: State, hold: bool) -> Float:
 
 
 def _staged(objective: Objective, state: State, of_closures: Float, control: float, hold: bool) -> tuple[State, Stage]:
-    """Go down the objective of one control parameter until a step changes its cost by little."""
-    weights, iterations = objective.weights(of_closures), 0
+    """Go down the objective of one control parameter until a step changes its cost by little.
+
+    A step of which no part goes down does not say that the cost rests, and a damped one follows: directions between
+    poses that meet have a kink there, which a step that would pass it does not see.
+    """
+    weights, iterations, damping = objective.weights(of_closures), 0, 0.0
+    steps_max = objective.config.gnc_inner_steps
     before = cost = objective.cost(state, weights, hold)
     while True:
-        solved = descend(objective, state, weights, steps_max=objective.config.gnc_inner_steps, hold=hold)
+        solved = descend(objective, state, weights, steps_max, hold, damping)
         iterations += solved.iterations
+        refused = solved.cost == cost and not solved.converged
         state, decrease, cost = solved.state, cost - solved.cost, solved.cost
-        if decrease <= MOVED_RATIO * cost or iterations >= STAGE_STEPS_MAX:
-            return state, Stage(control, before, cost, iterations, decrease <= MOVED_RATIO * cost)
+        resting = decrease <= MOVED_RATIO * cost and not refused
+        if resting or iterations >= STAGE_STEPS_MAX:
+            return state, Stage(control, before, cost, iterations, resting)
+        damping = max(damping * DAMPING_FACTOR, DAMPING_MIN) if refused else 0.0
 
 
 def initial_control(solver: Solver, squared: Float, bound: Float, start_ratio: float) -> float:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.backend.averaging import averaged
 from flocc_agent.backend.descent import Objective, Solved, descend, voted_cost
-from flocc_agent.backend.edges import State, residuals
+from flocc_agent.backend.edges import State, directions, residuals
 from flocc_agent.backend.graduated import graduated
 from flocc_agent.backend.placing import NEARLY_RATIO, Places
 from flocc_agent.config import Solver
@@ -71,13 +71,20 @@ def solve_once(objective: Objective, state: State, places: Places) -> Solved:
 
 def searching(objective: Objective) -> Objective:
     """The objective with the sharp bound and the tolerance of searches, where others are configured."""
-    config = objective.config
-    bound = min(config.kept_probability, config.inlier_probability)
-    tolerance = max(config.relative_tolerance, SEARCH_TOLERANCE_RATIO)
-    if (bound, tolerance) == (config.kept_probability, config.relative_tolerance):
+    bound = min(objective.config.kept_probability, objective.config.inlier_probability)
+    return configured(coarse(objective), kept_probability=bound)
+
+
+def coarse(objective: Objective) -> Objective:
+    """The objective with the tolerance of searches, where a finer one is configured."""
+    return configured(objective, relative_tolerance=max(objective.config.relative_tolerance, SEARCH_TOLERANCE_RATIO))
+
+
+def configured(objective: Objective, **values: float) -> Objective:
+    """The objective with other settings; itself where it has these."""
+    if all(getattr(objective.config, name) == value for name, value in values.items()):
         return objective
-    search = {"kept_probability": bound, "relative_tolerance": tolerance}
-    return replace(objective, config=config.model_copy(update=search))
+    return replace(objective, config=objective.config.model_copy(update=values))
 
 
 def to_rest(objective: Objective, solved: Solved) -> Solved:
@@ -87,18 +94,27 @@ def to_rest(objective: Objective, solved: Solved) -> Solved:
     covariance: a search with it would also take wrong ones for right. Where the search ended GNC begins once more with
     it, but late; what it finds is taken where nothing that was used is turned away for it.
     """
-    if objective.has_directions:
-        return solved
-    used = accepted(objective, solved)
+    hold, used = objective.has_directions, accepted(objective, solved)
+    if hold:
+        objective = coarse(objective)
     if objective.config.kept_probability > objective.config.inlier_probability and not np.all(used):
-        stages = graduated(objective, solved.state, WIDENED_RATIO)
-        widened = selected(objective, stages.state, solved.iterations + stages.iterations)
+        stages = graduated(widening(objective, used), solved.state, WIDENED_RATIO, hold)
+        widened = selected(objective, stages.state, solved.iterations + stages.iterations, hold)
         if np.all(accepted(objective, widened) >= used):
             return widened
         solved = replace(solved, iterations=widened.iterations)
-    if searching(objective) is objective:
+    if searching(objective) is objective or hold:
         return solved
     return selected(objective, solved.state, solved.iterations)
+
+
+def widening(objective: Objective, used: Bool) -> Objective:
+    """The objective in which of the closures that are not used only those take part whose bound is a wide one.
+
+    The others come back where the poses that these give agree with them: a wrong direction that pulls soon agrees.
+    """
+    away = ~used & directions(objective.edges)[objective.closures]
+    return replace(objective, held=away if objective.held is None else objective.held | away)
 
 
 def continued(objective: Objective, state: State) -> Solved:

@@ -308,6 +308,10 @@ class GraphAssembly:
         """Pairs that would tell whether the tentative joins of a pair's two logs are right."""
         return self._tentative.of(pair.low.log, pair.high.log).asked
 
+    def forget_built(self) -> None:
+        """Nobody asks for the graph for now: keep nothing of it that can be made anew."""
+        self._closures.forget_built()
+
     def _trajectory(self, log: LogId) -> Trajectory:
         T_odom_keyframe = self._odometry[log].matrices()
         return Trajectory(T_odom_keyframe, self._measured.edge_covariances(log, len(T_odom_keyframe)))

@@ -20,6 +20,7 @@ from flocc_agent.core.known_sets import pair_number, pair_of, place_of
 from flocc_agent.core.parameters import KEYFRAMES_HELD
 from flocc_agent.core.pose_graph import LoopClosure
 from flocc_agent.geometry import inverse, poses_from_tq, symmetric
+from flocc_protocol.arrays import Array
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 from flocc_protocol.records import UPPER_TRIANGLE, ClosureRecord
@@ -28,7 +29,7 @@ Float = NDArray[np.float64]
 Rows = NDArray[np.void]
 
 ROWS_OF_A_PIECE = 64
-"""Closures that leave memory together: some 17 kB."""
+"""Closures that leave memory together: some 12 kB."""
 ROW = np.dtype(
     [
         ("query_log", "<u4"),
@@ -42,11 +43,13 @@ ROW = np.dtype(
         ("T", "<f8", 7),
         ("match_ratio", "<f8"),
         ("scale", "<f8"),
-        ("covariance", "<f8", UPPER_TRIANGLE),
+        ("covariance", "<f4", UPPER_TRIANGLE),
     ]
 )
-"""Both keyframes, by the numbers of their logs here; log and number of the record; what it says."""
-PACKED = Struct(f"<8I7ddd{UPPER_TRIANGLE}d")
+"""Both keyframes, by the numbers of their logs here; log and number of the record; what it says, with the covariance in
+float32 as on the wire."""
+PACKED = Struct("<8I7ddd")
+"""What comes before the covariance."""
 WHERE = Struct("<8I3d")
 """Of a row: what comes before the rotation."""
 SCALE_AT = ROW.fields["scale"][1] if ROW.fields is not None else 0
@@ -54,7 +57,8 @@ COUNT_MAX = 2**16 - 1
 LENGTH_MIN = 1e-9
 Rank = Callable[[LogId, int, CandidatePair], int]
 Counts = Callable[[LogId, int, CandidatePair], bool]
-NO_COVARIANCE = (0.0,) * UPPER_TRIANGLE
+NO_COVARIANCE = bytes(4 * UPPER_TRIANGLE)
+FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 
 class Tie(NamedTuple):
@@ -123,27 +127,28 @@ class ClosureTable:
         if of_pair is None:
             of_pair = self._of_pair[key] = array("Q"), array("I")
         numbers, rows = of_pair
-        packed = pair_number(pair)
+        packed, row = pair_number(pair), len(self._rows)
+        logs = key if key[0] != key[1] else key[:1]
         at, is_there = place_of(numbers, packed)
         if is_there:
             held = rows[at]
             if self._order(log, number, pair) >= self._order(*self._registered(held), pair):
                 return False
-            for each in set(key):
+            for each in logs:
                 self._of_log[each].remove(held)
             self._built.pop(held, None)
-            rows[at] = len(self._rows)
+            rows[at] = row
         else:
             numbers.insert(at, packed)
-            rows.insert(at, len(self._rows))
+            rows.insert(at, row)
             self._count += 1
-            for end in (pair.low, pair.high):
-                self._count_end(end)
-        for each in set(key):
+            self._count_end(pair.low)
+            self._count_end(pair.high)
+        for each in logs:
             of_log = self._of_log.get(each)
             if of_log is None:
                 of_log = self._of_log[each] = array("I")
-            of_log.append(len(self._rows))
+            of_log.append(row)
         self._rows.append(self._packed(log, number, closure))
         return True
 
@@ -236,9 +241,11 @@ class ClosureTable:
         counts = self._ends.get(keyframe.log)
         if counts is None:
             counts = self._ends[keyframe.log] = array("H")
-        if keyframe.index >= len(counts):
-            counts.extend([0] * (keyframe.index + 1 - len(counts)))
-        counts[keyframe.index] = min(counts[keyframe.index] + 1, COUNT_MAX)
+        index = keyframe.index
+        if index >= len(counts):
+            counts.extend([0] * (index + 1 - len(counts)))
+        if counts[index] < COUNT_MAX:
+            counts[index] += 1
 
     def links(self) -> list[tuple[LogId, LogId]]:
         """Pairs of logs with closures between them, or within one."""
@@ -268,6 +275,10 @@ class ClosureTable:
             others.update(zip(new[room:], self._build(rows[new[room:]]), strict=True))
         found = [self._built.get(row) or others[row] for row in numbers]
         return [c for c in found if c.query not in unread and c.match not in unread] if unread else found
+
+    def forget_built(self) -> None:
+        """Nobody asks for the graph's closures for now: they are built anew when somebody does."""
+        self._built.clear()
 
     def _in_order(self, counts: Callable[[LogId], int]) -> NDArray[np.intp]:
         """Rows of pairs whose keyframes are below the counts of their logs, in the order of the pairs."""
@@ -302,7 +313,7 @@ class ClosureTable:
     def _packed(self, log: LogId, number: int, closure: ClosureRecord) -> bytes:
         (query_log, query), (match_log, match) = closure.query, closure.match
         triangle, scale = closure.covariance, closure.scale_initial
-        return PACKED.pack(
+        said = PACKED.pack(
             self._number(query_log),
             query,
             self._number(match_log),
@@ -314,8 +325,8 @@ class ClosureTable:
             *closure.T_query_match_unscaled,
             closure.match_ratio,
             scale or 0.0,
-            *(NO_COVARIANCE if triangle is None else triangle.numpy().tolist()),
         )
+        return said + (NO_COVARIANCE if triangle is None else _float32(triangle))
 
     def _registered(self, row: int) -> tuple[LogId, int]:
         """Log and number of the record of a row."""
@@ -335,3 +346,10 @@ class ClosureTable:
             number = self._numbers[log] = len(self._logs)
             self._logs.append(log)
         return number
+
+
+def _float32(values: Array) -> bytes:
+    """Values in float32, as nearly all come; another robot may send wider ones."""
+    if values.dtype == "f4":
+        return values.data
+    return np.clip(values.numpy(), -FLOAT32_MAX, FLOAT32_MAX).astype("<f4").tobytes()

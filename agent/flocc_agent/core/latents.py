@@ -217,14 +217,20 @@ class OffersHeard:
     def __init__(self) -> None:
         self._until_s: dict[str, dict[KeyframeId, float]] = {}
 
-    def hear(self, name: str, offers: Iterable[KeyframeId], now: float) -> tuple[KeyframeId, ...]:
+    def hear(self, name: str, offers: Sequence[KeyframeId], now: float) -> tuple[KeyframeId, ...]:
         """A robot told some: all that count of it now, the newest `RELAYS_MAX` at most."""
-        until_s = self._until_s.setdefault(name, {})
+        until_s = self._until_s.get(name)
+        if until_s is None:
+            if not offers:
+                return ()
+            until_s = self._until_s[name] = {}
         for keyframe in offers:
             until_s.pop(keyframe, None)
             remember(until_s, keyframe, now + HEARD_S, RELAYS_MAX)
         for keyframe in [k for k, end_s in until_s.items() if end_s <= now]:
             del until_s[keyframe]
+        if not until_s:
+            del self._until_s[name]
         return tuple(sorted(until_s))
 
     def on_lost(self, name: str) -> None:

@@ -146,7 +146,11 @@ class EncodedRecords(Sequence[bytes]):
         end = self._end
         count = end[0] * BLOCK_RECORDS + len(end[1])
         if isinstance(index, slice):
-            return [self._at(k, end) for k in range(*index.indices(count))]
+            first, last, step = index.indices(count)
+            newest = end[0] * BLOCK_RECORDS
+            if first >= newest and step == 1:
+                return end[1][first - newest : last - newest]
+            return [self._at(k, end) for k in range(first, last, step)]
         if not -count <= index < count:
             raise IndexError(f"record {index} of {count}")
         return self._at(index % count, end)

@@ -36,6 +36,7 @@ REGISTRATION_TIMEOUT_S = 120.0
 """A registration that gave no answer for this long is tried again; networks on a CPU need much of it."""
 ASLEEP_S = 10.0
 """A robot that was not woken for so long slept, and so did its workers: registrations have so much more time."""
+ASKED_AT_ONCE = 4
 ASKED_ORDER = 1.0
 """A pair that is asked for comes before all others, however alike it is."""
 UNLIKELY_AT_ONCE_MAX = 16
@@ -141,9 +142,13 @@ class LoopClosing:
         return effects
 
     def on_asked(self, candidates: Iterable[Candidate], now: float) -> list[Effect]:
-        """Pairs that would tell whether two ways are joined rightly: they come before all others, each once."""
+        """Pairs that would tell whether two ways are joined rightly: a few come before all others, each once."""
         effects: list[Effect] = []
+        candidates = list(candidates)
+        waiting = sum(self._prospects.was_asked(c.pair) and c.pair not in self._resolved for c in candidates)
         for candidate in candidates:
+            if waiting >= ASKED_AT_ONCE:
+                break
             pair, similarity = candidate.pair, candidate.similarity
             if self._front_ends.are_apart(pair) or not self._prospects.ask(pair):
                 continue
@@ -154,6 +159,7 @@ class LoopClosing:
                 fact = CandidateFound(query=pair.low, match=pair.high, similarity=round(similarity, 4))
                 effects.append(Report(fact))
                 self._assign(Candidate(pair, ASKED_ORDER), now)
+            waiting += pair not in self._resolved
         return effects
 
     def on_offer(self, offer: CandidateOffer, now: float) -> None:

@@ -116,6 +116,10 @@ class Prospects:
         self._held_since_s.pop(pair, None)
         return True
 
+    def was_asked(self, pair: CandidatePair) -> bool:
+        """Whether a pair was to be registered in any case."""
+        return pair in self._asked
+
     def was_refused_unseen(self, pair: CandidatePair) -> bool:
         """Whether no record says more of a pair than that it was refused unseen."""
         return pair in self._unlikely

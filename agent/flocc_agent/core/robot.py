@@ -96,6 +96,7 @@ from flocc_protocol.records import (
 NOBODY = -1
 """Compute class, as loop closing sees it, of a name under which two robots run: both would register what it gets."""
 OTHER_MODE_MAX = 256
+OF_LEADERSHIP = (Election, Answer, Coordinator, Handover)
 
 
 class Robot:
@@ -286,7 +287,7 @@ class Robot:
         sender, message = envelope.sender, envelope.message
         if sender.robot == self.log.robot and not isinstance(message, Heartbeat):
             return []
-        if isinstance(message, Election | Answer | Coordinator | Handover) and self._distrust.holds(sender, now):
+        if isinstance(message, OF_LEADERSHIP) and self._distrust.holds(sender, now):
             return []
         match message:
             case Heartbeat():

@@ -22,6 +22,8 @@ HURRIED_PERIOD_S = 0.5
 """Least pause between rounds while groups meet."""
 HURRY_MAX_S = 2.0
 """A meeting hurries rounds for one period, but no longer than this: a long period is somebody's wish to save work."""
+GRAPH_KEPT_S = 30.0
+"""So long a robot that leads no more keeps what it built of the graph, objects for each closure: it may lead again."""
 
 
 class Rounds:
@@ -53,6 +55,7 @@ class Rounds:
         self._hurried_until_s = float("-inf")
         self._started: tuple[int, int] | None = None
         self._failures = 0
+        self._graph_kept_until_s: float | None = None
         self._solution: ColdValue[GraphSolution] = ColdValue(cold)
 
     @property
@@ -101,8 +104,9 @@ class Rounds:
             self._try_again(now)
 
     def tick(self, now: float) -> list[Effect]:
-        """Give up a round that is overdue, start one that is wanted."""
+        """Give up a round that is overdue, start one that is wanted; who leads no longer forgets what it built."""
         if self._term is None:
+            self._rest(now)
             return []
         effects: list[Effect] = []
         if self._running_until_s is not None and self._running_until_s <= now:
@@ -122,7 +126,14 @@ class Rounds:
             return self._next_s
         return max(self._next_s, self._started_s + PATIENCE_S) if self._grown() else float("inf")
 
+    def _rest(self, now: float) -> None:
+        if self._graph_kept_until_s is None:
+            self._graph_kept_until_s = now + GRAPH_KEPT_S
+        elif self._graph_kept_until_s <= now:
+            self._assembly.forget_built()
+
     def _start(self, term: Term, now: float) -> Effect:
+        self._graph_kept_until_s = None
         self._round += 1
         self._running_until_s = now + TIMEOUT_S * 2**self._failures
         self._started_s = now

@@ -37,7 +37,6 @@ SPACING = 2
 """Keyframes between two pairs that say something each."""
 REFUSED_MIN = 3
 """Fewer refused pairs beside a join say nothing."""
-ASKED_AT_ONCE = 4
 SEEN_TWICE = 2.0
 """Times as far apart as both closures reach; scales by Eq. (6) are off by a tenth or two, odometry by less."""
 DRIFT_RATIO = 0.1

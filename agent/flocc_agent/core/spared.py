@@ -139,6 +139,8 @@ class Spared:
 
     def on_closure(self, pair: CandidatePair) -> list[tuple[CandidatePair, float]]:
         """A closure became known; pairs that it makes weak again, with their similarity. They are spared no more."""
+        if not self._enough:
+            return []
         near = sorted(self._similarities.beside(pair, STRETCH))
         if not near or self._agrees(pair):
             return []

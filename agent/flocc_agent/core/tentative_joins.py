@@ -16,7 +16,6 @@ from flocc_agent.core.closure_rows import ClosureTable
 from flocc_agent.core.known_sets import PairSet, pair_number
 from flocc_agent.core.second_places import (
     ACCIDENT_RATIO,
-    ASKED_AT_ONCE,
     CLOSURES_MAX,
     Between,
     Join,
@@ -59,7 +58,7 @@ class Tentative:
 
     Attributes:
         doubted: Closures that are held, and why.
-        asked: Pairs whose registration would tell most.
+        asked: Pairs whose registration would tell more, the most useful first.
         is_whole: Whether all of the closures' keyframes were known.
     """
 
@@ -172,7 +171,7 @@ class TentativeJoins:
         found = beside(between, join, (next(around), next(around)), self._refused_of(logs))
         robots, places = f"{logs[0].robot} and {logs[1].robot}", found.closed + found.refused
         why = f"{SECOND_PLACE}of {places} places where {robots} would be side by side {found.refused} do not match"
-        return (why if found.is_against else ""), found.open[:ASKED_AT_ONCE]
+        return (why if found.is_against else ""), found.open
 
     def _refused_of(self, logs: Logs) -> NDArray[np.int64]:
         """Keyframes (R, 2) of pairs of two logs that were refused; where another record says closure, that counts."""

@@ -35,6 +35,8 @@ class Withdrawals:
 
     def __init__(self) -> None:
         self._said: dict[tuple[LogId, LogId], list[_Said]] = {}
+        self._told_of: set[LogId] = set()
+        """Logs of which some log says that keyframes are withdrawn: few of them, while every judgement is looked at."""
         self._judged_anew: dict[CandidatePair, int] = {}
 
     def sizes(self) -> dict[str, tuple[int, int]]:
@@ -47,14 +49,19 @@ class Withdrawals:
         if len(said) >= WITHDRAWALS_MAX:
             return False
         said.append(_Said(number, record))
+        self._told_of.add(record.log)
         return author == record.log
 
     def counts(self, author: LogId, number: int, pair: CandidatePair) -> bool:
         """Whether what a record of a log says of a pair counts, as far as is known."""
+        if not self._tells_of(pair):
+            return True
         return all(self._rank(author, number, end) >= self._needed(end) for end in (pair.low, pair.high))
 
     def rank(self, author: LogId, number: int, pair: CandidatePair) -> int:
         """Of how many withdrawals a judgement knew: of several, one that counts has the highest rank."""
+        if not self._tells_of(pair):
+            return 0
         return sum(self._rank(author, number, end) for end in (pair.low, pair.high))
 
     def on_judged(self, author: LogId, number: int, pair: CandidatePair) -> None:
@@ -90,6 +97,9 @@ class Withdrawals:
     def is_final(self, keyframe: KeyframeId) -> bool:
         """Whether a keyframe's robot took it back for good: nothing that is judged of it counts."""
         return self._needed(keyframe) >= NEVER
+
+    def _tells_of(self, pair: CandidatePair) -> bool:
+        return pair.low.log in self._told_of or pair.high.log in self._told_of
 
     def _needed(self, keyframe: KeyframeId) -> int:
         """Which of its robot's withdrawals a judgement must have known."""

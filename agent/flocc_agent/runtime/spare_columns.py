@@ -68,8 +68,12 @@ def spare_notes(table: Table, spare: Sequence[Name]) -> tuple[str, ...]:
 
 
 def comment_notes(table: Table) -> tuple[str, ...]:
-    """What stands in comments before the rows and names no columns, in at most one sentence: nobody has read it."""
-    said = [text for _, text in table.headers if re.search(r"[^\W\d_]{2}", text) and not names_columns(text)]
+    """What stands in comments and names no columns, in at most one sentence: nobody has read it."""
+    said = [
+        text
+        for _, text in (*table.headers, *table.remarks)
+        if re.search(r"[^\W\d_]{2}", text) and not names_columns(text)
+    ]
     told = "; ".join(repr(text[:COMMENT_LETTERS_MAX]) for text in said[:COMMENTS_MAX])
     more = f" and {len(said) - COMMENTS_MAX} more" if len(said) > COMMENTS_MAX else ""
     return (f"{table.path}: comments that were not used: {told}{more}",) if said else ()

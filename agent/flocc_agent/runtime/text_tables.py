@@ -42,12 +42,14 @@ class Table:
         headers: Lines before the first row that may name its columns: comments, and a line without a number.
         rows: Line numbers and fields, as text.
         trailing_separator: Whether rows end with a separator, as some programs write them.
+        remarks: Comments behind the first row.
     """
 
     path: Path
     headers: tuple[tuple[int, str], ...]
     rows: list[tuple[int, list[str]]]
     trailing_separator: bool
+    remarks: tuple[tuple[int, str], ...] = ()
 
 
 def read_text(path: Path) -> str:
@@ -137,18 +139,19 @@ def read_table(path: Path) -> Table:
         RecordingError: It cannot be read, or is no text.
     """
     headers: list[tuple[int, str]] = []
+    remarks: list[tuple[int, str]] = []
     lines: list[tuple[int, str]] = []
     for number, text in numbered_lines(path):
         if text.startswith(COMMENTS):
-            if not lines:
-                headers.append((number, text.lstrip("#%/ \t")))
+            (remarks if lines else headers).append((number, text.lstrip("#%/ \t")))
         elif bare := re.sub(r"\s*(?:#|//).*", "", text):
             lines.append((number, bare))
     while lines and _is_words(lines[0][1]):
         headers.append(lines.pop(0))
     split = _Splitter(lines[0][1] if lines else "")
     rows = [(number, split(text)) for number, text in lines]
-    return Table(path, tuple(headers), rows, bool(lines) and lines[0][1].rstrip().endswith((",", ";")))
+    trailing = bool(lines) and lines[0][1].rstrip().endswith((",", ";"))
+    return Table(path, tuple(headers), rows, trailing, tuple(remarks))
 
 
 def _is_words(text: str) -> bool:

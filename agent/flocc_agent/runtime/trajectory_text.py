@@ -129,7 +129,7 @@ def _columns(table: Table, form: str | None, otherwise: str | None) -> Columns |
         return None
     if form is not None:
         return _named_form(form, table.path)
-    for line, header in table.headers:
+    for line, header in (*table.headers, *table.remarks):
         if (fault := contradiction(header)) is not None:
             raise RecordingError(f"{table.path}:{line}: {fault}; {WAY_OUT}")
     for line, header in reversed(table.headers):

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_lab.bench.overlays import KINDS, Overlay, overlay
+from flocc_lab.bench.drawn_overlays import KINDS, Overlay, overlay
 from flocc_launch.runs.loaded_run import load
 from flocc_launch.runs.right_closures import verdicts
 from flocc_launch.runs.run_folder import RunFolder

@@ -48,10 +48,16 @@ ENOUGH = 3
 """As many as the campaign's robots need."""
 
 
-class _Replay:
-    """A robot that knows all odometry, and learns of closures one after the other."""
+class Replay:
+    """A robot that knows all odometry, and learns of closures one after the other.
+
+    Attributes:
+        assembly: What it knows.
+        spared: Pairs that it does not register.
+    """
 
     def __init__(self, graph: PoseGraph, enough: int) -> None:
+        """Start without closures; `enough` that agree are enough, 0: no pair is spared."""
         self.assembly = GraphAssembly()
         self.spared = Spared(self.assembly, enough)
         self._numbers: dict[LogId, int] = {}
@@ -74,7 +80,7 @@ class _Replay:
 
 def kept_of(graph: PoseGraph, enough: int = ENOUGH) -> list[int]:
     """Which closures of a graph a swarm would have registered; sorted."""
-    replay, kept = _Replay(graph, enough), set[int]()
+    replay, kept = Replay(graph, enough), set[int]()
     numbers = {CandidatePair.of(c.query, c.match): k for k, c in enumerate(graph.closures)}
     for pair in sorted(numbers, key=lambda each: (max(each.low.index, each.high.index), each)):
         if replay.spared.is_told(pair):

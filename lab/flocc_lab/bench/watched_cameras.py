@@ -24,7 +24,7 @@ from flocc_agent.perception.classical.features import FeatureExtractor, Features
 from flocc_agent.perception.classical.sift_registrar import classical_registrar
 from flocc_agent.perception.multiview.picture import rays_of
 from flocc_agent.perception.watch.camera_watch import CameraWatch
-from flocc_lab.bench.overlays import overlay
+from flocc_lab.bench.drawn_overlays import overlay
 from flocc_lab.bench.registration_scenes import SceneView
 from flocc_lab.bench.watched_drives import Drive, drawn_drives, recorded_drives
 

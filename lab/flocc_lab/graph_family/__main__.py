@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flocc_lab.graph_family.family_campaign import run, table
-from flocc_lab.graph_family.family_spec import drawn
+from flocc_lab.graph_family.family_spec import Lengths, drawn
 from flocc_lab.graph_family.graphs import KnownGraph, member
 from flocc_lab.graph_family.methods import Method, flocc, methods, settings
 from flocc_lab.graph_family.recording_variants import variant
@@ -25,7 +25,8 @@ def main() -> None:
         graph_of: Callable[[int], KnownGraph] = partial(variant, files=files)
     else:
         graph_of = member
-        seeds = [seed for seed in seeds if sum(drawn(seed).keyframes) <= options.keyframes_max]
+        specs = [spec for spec in map(drawn, seeds) if sum(spec.keyframes) <= options.keyframes_max]
+        seeds = [spec.seed for spec in specs if options.lengths in (None, spec.lengths.value)]
     verdicts = run(seeds, chosen, options.rows, options.limit_s, graph_of)
     sys.stdout.write(table([v for v in verdicts if v.method in chosen]) + "\n")
 
@@ -36,6 +37,8 @@ def parsed(words: list[str]) -> argparse.Namespace:
     parser.add_argument("--draws", type=int, default=60, help="number of graphs")
     parser.add_argument("--first", type=int, default=1, help="seed of the first graph")
     parser.add_argument("--keyframes-max", type=int, default=10**9, help="leave out graphs with more keyframes")
+    lengths = [kind.value for kind in Lengths]
+    parser.add_argument("--lengths", choices=lengths, help="only graphs whose closures are known so far")
     parser.add_argument(
         "--recordings", type=Path, nargs="+", metavar="FILE", help="variants of labelled recordings (JRL) instead"
     )

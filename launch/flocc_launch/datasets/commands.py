@@ -521,7 +521,7 @@ def _seen(source: Source, is_settled: bool) -> tuple[str, ...]:
 def _given_odometry(source: Source, path: Path, form: str | None, time_offset_s: float) -> Trajectory:
     read, notes = read_trajectory(path, form, [stamp_s for stamp_s, _ in source.images])
     given = read.later(time_offset_s)
-    _log(notes)
+    _log(note for note in notes if note not in source.notes)
     check_times(source, given, path)
     return given.relative_to_first()
 

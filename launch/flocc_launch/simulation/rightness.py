@@ -40,6 +40,7 @@ class Right:
 
     _solutions: dict[tuple[Term, int], GraphSolution] = field(default_factory=dict)
     _roles: dict[tuple[str, CandidatePair], tuple[KeyframeId, KeyframeId]] = field(default_factory=dict)
+    _taken_back: dict[tuple[str, CandidatePair], set[KeyframeId]] = field(default_factory=dict)
     _odometry: dict[tuple[str, int], RecordedOdometry] = field(default_factory=dict)
 
     def step(self, step: Step) -> Iterator[str]:
@@ -49,6 +50,7 @@ class Right:
         for effect in step.effects:
             if isinstance(effect, Register):
                 self._roles[step.station.name, effect.pair] = effect.query, effect.match
+                self._taken_back[step.station.name, effect.pair] = _taken_back(step.station, effect.pair)
             elif isinstance(effect, Deliver):
                 yield from self._delivered(step.station, effect.correction)
         if isinstance(step.event, PairRegistered):
@@ -69,6 +71,8 @@ class Right:
             name = f"{step.station.name} records {record.query} {record.match}"
             if (record.query, record.match) != self._roles.get((step.station.name, event.pair)):
                 yield f"{name}, which it registered the other way round"
+            if _taken_back(step.station, event.pair) != self._taken_back.get((step.station.name, event.pair)):
+                yield f"{name}, a latent of which was made anew meanwhile"
             yield from (f"{name}, {what}" for what in _differs(record, event.result))
 
     def _delivered(self, station: Station, correction: LogCorrection) -> Iterator[str]:
@@ -92,6 +96,11 @@ class Right:
             and (told is None or not _same_covariance(symmetric(told.numpy()), solved))
         ):
             yield f"{name} with another covariance than was solved"
+
+
+def _taken_back(station: Station, pair: CandidatePair) -> set[KeyframeId]:
+    """Keyframes of a pair that their robot took back, as far as a robot knows."""
+    return {end for end in (pair.low, pair.high) if core(station).assembly.withdrawals.is_withdrawn(end)}
 
 
 def _other_poses(correction: LogCorrection, odometry: RecordedOdometry, component: Component) -> Iterator[str]:

@@ -206,13 +206,14 @@ class Station:
         """Let the core know, and carry out what it wants; while it waits for its disk, later."""
         assert self.core is not None
         if self._agenda.now_s < self._blocked_until_s:
-            self.unheard |= {event.keyframe} if isinstance(event, LatentFetched) else set()
+            if isinstance(event, LatentFetched):
+                self.unheard.add(event.keyframe)
             self.later(self._blocked_until_s, lambda: event)
             return
-        self.unheard -= {event.keyframe} if isinstance(event, LatentFetched) else set()
+        if isinstance(event, LatentFetched):
+            self.unheard.discard(event.keyframe)
         effects = self.core.handle(event, self.now_s())
-        came_late = any(isinstance(effect, Report) and isinstance(effect.fact, SolutionIgnored) for effect in effects)
-        if isinstance(event, GraphOptimised) and not came_late:
+        if isinstance(event, GraphOptimised) and not _came_late(effects):
             self.solution = event.solution
         self._carry_out(event, effects)
 
@@ -347,6 +348,11 @@ class Station:
         if not self.lies or not isinstance(message, CorrectionBatch):
             return message
         return CorrectionBatch(tuple(_far_away(c) if c.term.leader == self.log else c for c in message.corrections))
+
+
+def _came_late(effects: list[Effect]) -> bool:
+    """Whether a solution was ignored."""
+    return any(isinstance(effect, Report) and isinstance(effect.fact, SolutionIgnored) for effect in effects)
 
 
 def _far_away(correction: LogCorrection) -> LogCorrection:

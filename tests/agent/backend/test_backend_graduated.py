@@ -9,18 +9,18 @@ from tests.agent.backend.plain_team import plain_team
 from flocc_agent.backend import solvers
 from flocc_agent.backend.descent import Objective, Solved, descend
 from flocc_agent.backend.edges import State, state_of
-from flocc_agent.backend.graduated import Graduated, graduated
+from flocc_agent.backend.graduated import STAGE_STEPS_MAX, Graduated, graduated
 from flocc_agent.backend.initial import initial_poses
 from flocc_agent.backend.linear import LinearSolver
 from flocc_agent.backend.optimiser import optimise
-from flocc_agent.backend.problem import build
+from flocc_agent.backend.problem import build, closure_edges, concatenate, plain_edges
 from flocc_agent.backend.solvers import SEARCH_TOLERANCE_RATIO, best, explains, scheduled, searching, solve
 from flocc_agent.config import BackendConfig, Solver
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution, LoopClosure, PoseGraph
 from flocc_agent.geometry import inverse, pose
 from flocc_lab.graph_family.family_spec import Lengths, drawn
 from flocc_lab.graph_family.graphs import Member, made, member
-from flocc_protocol.ids import KeyframeId
+from flocc_protocol.ids import KeyframeId, LogId
 
 LONG_WEAK_CHAIN = 42
 """Four robots with 880 to 1,830 keyframes, joined by a handful of right closures, one in five wrong."""
@@ -62,6 +62,28 @@ def test_a_step_that_overshoots_is_shortened_before_it_is_damped() -> None:
     once = descend(objective, state, weights, steps_max=1)
     assert once.iterations == 1
     assert once.cost < objective.cost(state, weights, hold=False)
+
+
+def test_a_stage_goes_on_where_a_direction_between_poses_that_meet_refuses_its_step() -> None:
+    """One pose would pass another one, of which a direction says that it is ahead; a third one only has to be moved."""
+    T_hat = np.tile(np.eye(4), (2, 1, 1))
+    T_hat[:, 0, 3] = -10.0, 0.5
+    L = np.array([np.eye(6) / 2.5, np.eye(6) / 0.05])
+    zero = np.zeros(2, dtype=np.int64)
+    direction = LoopClosure(
+        KeyframeId(LogId("a"), 0), KeyframeId(LogId("b"), 0), pose(np.eye(3), np.eye(3)[0]), covariance=0.02 * np.eye(6)
+    )
+    config, offsets = BackendConfig(weight_by_probability=False), {LogId("a"): 0, LogId("b"): 1}
+    closures, _ = closure_edges([direction], offsets, np.ones(1), config)
+    edges = concatenate([plain_edges(zero, np.array([1, 2]), T_hat, L), closures])
+    objective = Objective(edges, slice(2, 3), LinearSolver(0, 1.0), config)
+    T = np.tile(np.eye(4), (3, 1, 1))
+    T[1, :2, 3] = 0.02, 0.005
+    once = descend(objective, state_of(T), objective.weights(), steps_max=1, hold=True)
+    first, *_ = graduated(objective, state_of(T), 1.0, hold=True).stages
+    assert once.cost == first.cost_before
+    assert first.cost_after < 0.5 * first.cost_before
+    assert first.iterations <= STAGE_STEPS_MAX
 
 
 def test_rejected_closures_leave_the_solution_as_if_they_were_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,6 +174,26 @@ def test_a_closure_just_outside_of_the_sharp_bound_is_kept_and_one_far_outside_i
             assert isinstance(solution, GraphSolution)
             states.append(solution.closures[0].state is ClosureState.USED)
     assert states == [False, True, False, False]
+
+
+def test_beside_closures_without_a_unit_the_wide_bound_is_for_those_in_metres() -> None:
+    """The same closure within a robot is 9 and 12 standard deviations off; directions keep the sharp bound."""
+    team = plain_team(5, (60, 60), lengths=Lengths.UNIT, closures=80)
+    within = next(k for k, closure in enumerate(team.graph.closures) if closure.metric)
+    states = []
+    for sigmas in (9.0, 12.0):
+        closures = list(team.graph.closures)
+        off = closures[within].T_query_match_unscaled.copy()
+        off[:2, 3] += 0.05 * sigmas / np.sqrt(2.0)
+        closures[within] = replace(closures[within], T_query_match_unscaled=off)
+        solution = optimise(PoseGraph(team.graph.trajectories, closures), BackendConfig(weight_by_probability=False))
+        assert isinstance(solution, GraphSolution)
+        states.append(solution.closures[within].state is ClosureState.USED)
+    assert states == [True, False]
+    objective, _ = objective_of(team, Solver.GNC_TLS)
+    metric = np.array([closure.metric for closure in team.graph.closures])
+    assert np.unique(objective.bounds()[~metric]) == pytest.approx([25.7], abs=0.1)
+    assert np.unique(objective.bounds()[metric]) == pytest.approx([58.3], abs=0.1)
 
 
 def test_the_wide_bound_does_not_choose_where_a_search_ends() -> None:

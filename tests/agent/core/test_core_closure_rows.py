@@ -1,7 +1,10 @@
 """What a correction is held against: closures and measurements of its log, without those of others and unread."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from flocc_agent.core import measured_records
 from flocc_agent.core.assembly import GraphAssembly
@@ -63,6 +66,26 @@ def test_of_two_registrations_of_a_pair_one_is_a_tie() -> None:
     known.add(R3, closure(at(R1, 0), at(R2, 1), 9.0))
     assert known.assembly.ties(R1, 10) == [Tie(0, at(R2, 1), 8.0)]
     assert known.assembly.ties(R2, 10) == [Tie(1, at(R1, 0), 8.0)]
+
+
+@pytest.mark.parametrize(
+    ("sent", "kept"),
+    [
+        (Array.of(np.linspace(-0.1, 3e-9, 21), "f4"), np.linspace(-0.1, 3e-9, 21, dtype=np.float32)),
+        (Array.of(np.full(21, 1e300), "f8"), np.full(21, np.finfo(np.float32).max)),
+        (Array.int8(np.linspace(-12.7, 12.7, 21)), Array.int8(np.linspace(-12.7, 12.7, 21)).numpy().astype(np.float32)),
+        (None, None),
+    ],
+    ids=["as all robots send it", "beyond float32", "int8", "none"],
+)
+def test_a_covariance_is_kept_in_float32(sent: Array | None, kept: NDArray[np.float32] | None) -> None:
+    known = Known()
+    known.add(R1, replace(closure(at(R1, 0), at(R2, 1), 1.0), covariance=sent))
+    (found,) = known.assembly.graph().closures
+    assert (found.covariance is None) == (kept is None)
+    if found.covariance is not None and kept is not None:
+        assert found.covariance[np.triu_indices(6)].tolist() == kept.tolist()
+        assert found.covariance.tolist() == found.covariance.T.tolist()
 
 
 def test_measurements_of_other_logs_are_not_paid_for(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -710,3 +710,18 @@ def test_a_result_for_a_pair_that_another_robot_resolved_is_not_recorded_again()
     assert event is not None
     robots.put("r1", event)
     assert len(robots.cores["r1"].gossip.logs[R1]) == before
+
+
+def test_a_few_pairs_are_asked_for_at_a_time_each_once_and_before_all_others() -> None:
+    machine = closing()
+    asked = [Candidate(pair, 0.2) for pair in pairs_of(R1, 6)]
+    (other,) = set(pairs_of(R1, 7)) - {candidate.pair for candidate in asked}
+    machine.on_candidates([Candidate(other, 0.9)], 0.0)
+    assert len(machine.on_asked(asked, 0.0)) == 4
+    assert machine.on_asked(asked, 0.0) == []
+    assert [work.pair for work in machine._work] == [*(c.pair for c in asked[:4]), other]
+    machine.on_rejection(asked[0].pair, "a latent was lost", was_seen=False)
+    assert len(machine.on_asked(asked, 0.0)) == 1
+    machine.on_closure(asked[1].pair, 0.0)
+    assert len(machine.on_asked(asked, 0.0)) == 1
+    assert machine.on_asked(asked, 0.0) == []

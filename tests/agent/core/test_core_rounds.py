@@ -10,7 +10,14 @@ from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.parameters import RoundParameters
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.reports import RoundTimedOut
-from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND, PATIENCE_S, PERIOD_PER_KEYFRAME_S, TIMEOUT_S, Rounds
+from flocc_agent.core.rounds import (
+    GRAPH_KEPT_S,
+    KEYFRAMES_PER_ROUND,
+    PATIENCE_S,
+    PERIOD_PER_KEYFRAME_S,
+    TIMEOUT_S,
+    Rounds,
+)
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.records import ClosureRecord, KeyframeRecord
 
@@ -53,6 +60,26 @@ def test_nobody_optimises_who_does_not_lead() -> None:
     rounds.on_term(None)
     assert rounds.tick(0.0) == []
     assert rounds.deadline() == float("inf")
+
+
+def test_who_leads_no_longer_keeps_nothing_that_it_built_after_a_while() -> None:
+    rounds, assembly = leading()
+    add_keyframes(assembly, R2, 0, 1)
+    assembly.add(NewRecord(R1, 1, closure("r1/0", "r2/0")))
+    rounds.tick(0.0)
+    (built,) = assembly.graph().closures
+    rounds.on_term(None)
+    for now in (1.0, 1.0 + GRAPH_KEPT_S - 0.1):
+        rounds.tick(now)
+        assert assembly.sizes()["built_closures"][0] == 1
+    rounds.tick(1.0 + GRAPH_KEPT_S)
+    assert assembly.sizes()["built_closures"][0] == 0
+    (again,) = assembly.graph().closures
+    assert (again.query, again.match) == (built.query, built.match)
+    rounds.on_term(Term(TERM.counter + 1, TERM.leader))
+    rounds.tick(2.0 + GRAPH_KEPT_S)
+    rounds.tick(100.0 + GRAPH_KEPT_S)
+    assert assembly.sizes()["built_closures"][0] == 1
 
 
 def test_nothing_new_calls_for_no_round() -> None:

@@ -67,7 +67,7 @@ def joined(*closures: tuple[int, int]) -> Team:
 
 def test_a_join_of_one_place_asks_for_what_is_beside_it_the_nearest_first() -> None:
     team = joined((14, 10), (15, 11))
-    assert [j - i for i, j in team.asked()] == [-4] * 4
+    assert [j - i for i, j in team.asked()] == [-4] * 10
     assert all(abs(i - 14) <= abs(later - 14) for (i, _), (later, _) in pairwise(team.asked()))
     assert not team.doubts()
 

@@ -26,7 +26,7 @@ from flocc_agent.perception.watch.camera_verdict import CameraFault, CameraVerdi
 from flocc_agent.perception.watch.camera_watch import CameraWatch
 from flocc_agent.perception.watch.overlay import OverlayFinder, place_of
 from flocc_agent.perception.watch.seen_motion import Flow, flow_of, moves_with_the_scene
-from flocc_lab.bench.overlays import overlay
+from flocc_lab.bench.drawn_overlays import overlay
 from flocc_protocol.arrays import Array
 
 Float = NDArray[np.float64]

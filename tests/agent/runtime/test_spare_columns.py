@@ -76,5 +76,11 @@ def test_a_comment_by_which_poses_are_something_else_is_refused(tmp_path: Path, 
         read(tmp_path, f"{said}\n{table('vx', lambda _: 0)}")
 
 
+def test_a_comment_behind_the_rows_counts_as_one_before_them(tmp_path: Path) -> None:
+    assert "'made by hand'" in read(tmp_path, table("vx", lambda _: 0) + "# made by hand\n")[-1]
+    with pytest.raises(RecordingError, match=":12: positions are said to be in another unit"):
+        read(tmp_path, table("vx", lambda _: 0) + "# units: centimetres\n")
+
+
 def test_poses_of_an_airframe_are_told_as_such(tmp_path: Path) -> None:
     assert any("x is forward, y right and z down" in note for note in read(tmp_path, table("pose_frame", lambda _: 1)))
