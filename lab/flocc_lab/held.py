@@ -34,13 +34,14 @@ UNBOUNDED = ("assembly._closures", "assembly._odometry", "closing._resolved", "g
 def held_kb(core: Robot) -> dict[str, int]:
     """Kilobytes by attribute of a core and of its machines, the largest first.
 
-    What helpers of the core share with its machines is the machines': they come first.
+    What helpers of the core and its machines refer to of another machine is that one's.
     """
     found: dict[str, int] = {}
-    seen = {id(core)}
-    for name, machine in sorted(vars(core).items(), key=lambda each: (each[0].startswith("_"), each[0])):
-        if type(machine).__module__.startswith(CORE) and hasattr(machine, "__dict__"):
-            seen.add(id(machine))
+    parts = sorted(vars(core).items(), key=lambda each: (each[0].startswith("_"), each[0]))
+    machines = {name for name, one in parts if type(one).__module__.startswith(CORE) and hasattr(one, "__dict__")}
+    seen = {id(core), *(id(machine) for name, machine in parts if name in machines)}
+    for name, machine in parts:
+        if name in machines:
             found |= {f"{name}.{part}": _size(value, seen) for part, value in sorted(vars(machine).items())}
         else:
             found[name] = _size(machine, seen)

@@ -157,6 +157,19 @@ def test_bytes_of_a_restarted_robot_are_added(folder: RunFolder) -> None:
     assert finish(folder).bytes_by_robot["r1"].sent["heartbeat"] == before + 10
 
 
+def test_that_distributed_mode_used_no_fixes_is_said(folder: RunFolder) -> None:
+    fix = {"t": 1.0, "robot": "r1", "event": "measured", "kind": "fix", "keyframe": "r1/0", "of": ""}
+    shared = {"t": 1e3, "robot": "r1", "event": "bytes", "sent": {"shared-poses": 10}, "received": {}}
+    told = []
+    for more in (shared, {**fix, "kind": "odometry"}, fix, fix):
+        with (folder.path / "events.jsonl").open("a") as file:
+            file.write(json.dumps(more) + "\n")
+        told.append([warning for warning in finish(folder).warnings if warning.startswith("Distributed mode")])
+    assert told[:2] == [[], []]
+    (sentence,) = told[3]
+    assert sentence.startswith("Distributed mode used no measurements: 2 of the kind fix were kept only")
+
+
 def test_evaluate_says_what_the_report_holds(folder: RunFolder) -> None:
     text = evaluate(folder.path)
     assert text.startswith("All three robots found one common map")

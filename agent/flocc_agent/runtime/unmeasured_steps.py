@@ -24,7 +24,8 @@ SPEED_M_S, TURN_RAD_S = 1.5, 0.5
 JUMP_RATIO = 3.0
 """Of a jump's length: where the robot truly was may be as far from where odometry says."""
 ANYWHERE_RAD = float(np.pi)
-LEAST_M = 1.0
+LEAST_M, ANYWHERE_M = 1.0, 1e5
+"""Beyond a hundred kilometres a larger one would change nothing, and make the solver's system worse."""
 STEPS_REMEMBERED = 20
 UNMEASURED_MAX = 16
 
@@ -64,7 +65,7 @@ def after_jump(T_before: Float, T_after: Float) -> OdometryCovariance:
 
 
 def _covariance(rotation_rad: float, translation_m: float) -> OdometryCovariance:
-    sigmas = [min(rotation_rad, ANYWHERE_RAD)] * 3 + [max(translation_m, LEAST_M)] * 3
+    sigmas = [min(rotation_rad, ANYWHERE_RAD)] * 3 + [min(max(translation_m, LEAST_M), ANYWHERE_M)] * 3
     return OdometryCovariance(np.diag(np.square(sigmas)))
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.reports import ClosureAccepted, PeerRefused, RoundSolved
+from flocc_agent.core.measurements import OdometryCovariance
+from flocc_agent.core.reports import ClosureAccepted, MeasurementKept, PeerRefused, RoundSolved
 from flocc_agent.runtime.event_lines import UnknownFact, of_kind
 from flocc_agent.runtime.facts import AgentDied, BytesCounted
 from flocc_agent.stages import BOUNDS_S
@@ -41,6 +42,7 @@ from flocc_launch.runs.timeline import (
 from flocc_launch.runs.tracks import RobotTrack
 from flocc_launch.runs.trajectory_errors import alignment, ate_m, relative_pose_error, unaligned_ate_m
 from flocc_launch.runs.version import flocc_version
+from flocc_protocol.keys import Kind
 
 Float = NDArray[np.float64]
 
@@ -285,11 +287,22 @@ def warnings_of(loaded: LoadedRun) -> list[str]:
         found.append(barred_sentence(loaded))
     found += [*other_clocks(loaded.tracks), *frame_sentences(loaded.tracks)]
     found += [f"{doubt.sentence} {doubt.advice}" for doubt in camera_doubts(events)]
+    found += unused_measurements(loaded)
     unknown = Counter(event.fact.name for event in of_kind(events, UnknownFact))
     for name, count in sorted(unknown.items()):
         found.append(f"This version does not know events of the kind {name} ({count} in this run).")
     rounds = of_kind(events, RoundSolved)
     return found + ([f"Last optimisation: {text}" for text in told_of(rounds[-1].fact.warnings)] if rounds else [])
+
+
+def unused_measurements(loaded: LoadedRun) -> list[str]:
+    """That distributed mode kept what was measured besides odometry, and did not use it."""
+    facts = [event.fact for event in of_kind(loaded.events, MeasurementKept)]
+    kinds = Counter(fact.kind for fact in facts if fact.kind != OdometryCovariance.kind)
+    if not kinds or not any(Kind.SHARED_POSES in robot.sent for robot in bytes_by_robot(loaded).values()):
+        return []
+    told = ", ".join(f"{count} of the kind {kind}" for kind, count in sorted(kinds.items()))
+    return [f"Distributed mode used no measurements: {told} were kept only; backend.mode = 'centralised' uses them."]
 
 
 def barred_sentence(loaded: LoadedRun) -> str:

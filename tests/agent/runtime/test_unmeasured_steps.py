@@ -14,7 +14,7 @@ from flocc_agent.core.measurements import OdometryCovariance
 from flocc_agent.core.pose_graph import GraphSolution, LoopClosure, PoseGraph, Trajectory
 from flocc_agent.geometry import between, inverse, pose, so3_exp
 from flocc_agent.runtime.recording import Recording
-from flocc_agent.runtime.unmeasured_steps import StepWatch, after_pause, pauses, unmeasured
+from flocc_agent.runtime.unmeasured_steps import StepWatch, after_jump, after_pause, pauses, unmeasured
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
@@ -52,6 +52,13 @@ def test_a_pause_is_one_of_odometry_and_not_of_photographs_or_of_the_camera() ->
             watch.saw(float(stamp_s), np.eye(4))
         step = watch.of_keyframe(float(paused[-1]))
         assert (step is not None) == counts
+
+
+@pytest.mark.parametrize("pause_s", [5.1, 86_400.0, 1e12])
+def test_however_long_a_pause_is_its_step_can_be_kept(pause_s: float) -> None:
+    assert after_pause(pause_s).covariance[3, 3] <= 1e10
+    far = pose(np.eye(3), np.array([1e7, -1e7, 0.0]))
+    assert after_jump(far, np.eye(4)).covariance[3, 3] <= 1e10
 
 
 def test_a_recording_says_so_of_the_frame_after_a_pause_but_where_it_says_it_itself(tmp_path: Path) -> None:
