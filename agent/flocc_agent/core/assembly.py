@@ -5,7 +5,7 @@ numbers, and become matrices when somebody wants them.
 """
 
 from array import array
-from bisect import bisect_right
+from bisect import bisect_right, insort
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from flocc_agent.core.closure_rows import ClosureTable, Tie
 from flocc_agent.core.cold_storage import ColdPieces, RowPieces
 from flocc_agent.core.gossip import NewRecord
-from flocc_agent.core.measured_records import MeasuredRecords
+from flocc_agent.core.measured_records import MeasuredRecords, is_unmeasured
 from flocc_agent.core.parameters import KEYFRAMES_HELD
 from flocc_agent.core.pose_graph import LoopClosure, MeasuredFactor, PoseGraph, Trajectory, groups_of
 from flocc_agent.core.pulls import remember
@@ -34,6 +34,7 @@ from flocc_protocol.records import (
     ClosureRecord,
     KeyframeRecord,
     LatentRecord,
+    OdometryCovarianceRecord,
     RejectionRecord,
     UnknownRecord,
     WithdrawalRecord,
@@ -52,13 +53,15 @@ class _Odometry:
     """One log's keyframes as columns: poses as its records give them, stamps, and whether each was described.
 
     The place of a keyframe that a later version wrote is taken by the pose of the next one; nothing is tied to it. Old
-    poses leave memory where there is a cold storage, and with them what was made of them.
+    poses leave memory where there is a cold storage, and with them what was made of them. `parts` has the keyframes
+    before which nobody measured the step.
     """
 
     def __init__(self, cold: ColdPieces | None = None) -> None:
         self.stamps_s = array("d")
         self.encoded = bytearray()
         self.unread: set[int] = set()
+        self.parts: list[int] = []
         self._poses = RowPieces(POSE.size, POSES_OF_A_PIECE, cold)
         self._matrices: Float = np.empty((0, 4, 4))
 
@@ -120,8 +123,11 @@ class _Odometry:
         return before, passed_s / lasts_s
 
     def neighbour(self, index: int) -> int | None:
-        """The nearest described keyframe before this one, for the first ones the nearest after it."""
-        around = chain(range(index - 1, -1, -1), range(index + 1, len(self.encoded)))
+        """The nearest described keyframe before this one, for the first ones of a part the nearest after it."""
+        part = bisect_right(self.parts, index)
+        first = self.parts[part - 1] if part else 0
+        end = self.parts[part] if part < len(self.parts) else len(self.encoded)
+        around = chain(range(index - 1, first - 1, -1), range(index + 1, end))
         return next((other for other in around if self.encoded[other]), None)
 
     def between(self, index: int, other: int) -> Pose7:
@@ -205,12 +211,26 @@ class GraphAssembly:
             case _:
                 self._revision += 1
                 self._await(self._measured.add(new, record))
+                if isinstance(record, OdometryCovarianceRecord) and is_unmeasured(record):
+                    self._part(new.log, record.index)
         return []
+
+    def _part(self, log: LogId, index: int) -> None:
+        """Nobody measured the step to a keyframe: what is before it is no neighbour of what is after."""
+        odometry = self._odometry.get(log)
+        if odometry is not None and index not in odometry.parts:
+            insort(odometry.parts, index)
+            self._forget_pairs(log)
+
+    def _forget_pairs(self, log: LogId) -> None:
+        for keyframe in [keyframe for keyframe in self._odometry_pairs if keyframe.log == log]:
+            del self._odometry_pairs[keyframe]
 
     def odometry_pair(self, keyframe: KeyframeId) -> tuple[KeyframeId, Pose7] | None:
         """The keyframe's neighbour in its log that has a latent, and `T_neighbour_query`.
 
-        The nearest before it; for the first ones the nearest after it, None as long as there is none.
+        The nearest before it; for the first ones, also those after a step that nobody measured, the nearest after it,
+        None as long as there is none.
         """
         found = self._odometry_pairs.get(keyframe)
         if found is None:
@@ -244,8 +264,7 @@ class GraphAssembly:
         if odometry is not None:
             self.keyframes -= len(odometry)
             self._revision += 1
-        for keyframe in [keyframe for keyframe in self._odometry_pairs if keyframe.log == log]:
-            del self._odometry_pairs[keyframe]
+        self._forget_pairs(log)
 
     def beside(self, pair: CandidatePair, reach: int) -> list[CandidatePair]:
         """Closures with a length between the same stretches as a pair, as far as all keyframes are known."""

@@ -27,6 +27,8 @@ Float = NDArray[np.float64]
 Place = tuple[LogId, int]
 """A log and the number of a record in it."""
 
+UNMEASURED_RAD = 1.0
+
 
 class MeasuredRecords:
     """What was measured besides odometry and images, of every known log."""
@@ -118,6 +120,11 @@ class MeasuredRecords:
             if 1 <= index < keyframes:
                 covariances[index - 1] = covariance
         return covariances
+
+
+def is_unmeasured(record: OdometryCovarianceRecord) -> bool:
+    """Whether odometry says nothing of a step: its rotation may be off by more than a radian."""
+    return float(record.covariance.numpy()[0]) > UNMEASURED_RAD**2
 
 
 def _robots_of(log: LogId, record: Record) -> set[str]:

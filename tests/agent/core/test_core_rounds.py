@@ -7,6 +7,7 @@ from tests.agent.core.virtual_time import Robots, answer, descriptor, keyframe
 from flocc_agent.core.assembly import GraphAssembly
 from flocc_agent.core.effects import Effect, Optimise, Report
 from flocc_agent.core.gossip import NewRecord
+from flocc_agent.core.measurements import OdometryCovariance
 from flocc_agent.core.parameters import RoundParameters
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.reports import RoundTimedOut
@@ -239,6 +240,18 @@ def test_the_odometry_pair_of_a_first_keyframe_is_the_one_after() -> None:
     assert assembly.odometry_pair(keyframe("r1/0")) is None
     add_keyframes(assembly, R1, 1, 2)
     assert assembly.odometry_pair(keyframe("r1/0")) == (keyframe("r1/1"), (-1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+
+
+def test_no_odometry_pair_goes_over_a_step_that_nobody_measured() -> None:
+    assembly = GraphAssembly()
+    add_keyframes(assembly, R1, 0, 2)
+    add_keyframes(assembly, R1, 2, 4)
+    exact, carried = (OdometryCovariance(sigma**2 * np.eye(6)).record(keyframe("r1/2")) for sigma in (0.05, 2.0))
+    assembly.add(NewRecord(R1, 90, exact))
+    assert assembly.odometry_pair(keyframe("r1/2")) == (keyframe("r1/1"), (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+    assembly.add(NewRecord(R1, 91, carried))
+    assert assembly.odometry_pair(keyframe("r1/2")) == (keyframe("r1/3"), (-1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+    assert assembly.odometry_pair(keyframe("r1/1")) == (keyframe("r1/0"), (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
 
 
 def test_a_keyframe_that_could_not_be_encoded_is_no_partner_of_an_odometry_pair() -> None:
