@@ -31,7 +31,7 @@ from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.given_keyframes import GivenKeyframes
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import Digests, Envelope, LogDigest, RecordBatch, Records
-from flocc_protocol.records import FixRecord, KeyframeRecord, PoseFixRecord, encode_record
+from flocc_protocol.records import FixRecord, KeyframeRecord, OdometryCovarianceRecord, PoseFixRecord, encode_record
 
 ALONE = TransportConfig(
     control_listen=("tcp/127.0.0.1:0",), bulk_listen=("tcp/127.0.0.1:0",), multicast=False, gossip=False
@@ -222,6 +222,28 @@ async def test_a_frame_that_is_too_fast_or_not_newer_is_refused_and_the_agent_go
                 await agent.add_frame(pixels, at_m(x), stamp_s)
         assert await agent.add_frame(pixels, at_m(1.0), 11.0)
         assert [x for _, _, x in await recorded(agent, 2)] == [0.0, 1.0]
+
+
+async def test_the_step_of_a_jump_is_left_to_closures_and_said(caplog: pytest.LogCaptureFixture) -> None:
+    """Odometry begins anew at the twelfth frame, 12 m away; the keyframe there says that the step was not measured."""
+    pixels = pose_image(np.eye(4), "r1/0").pixels
+    async with Agent(CONFIG, camera()) as agent:
+        for k in range(16):
+            x = 0.1 * k if k < 12 else 0.1 * k - 12.0
+            await agent.add_frame(pixels, at_m(x), 10.0 + 0.1 * k)
+        async with asyncio.timeout(20.0):
+            while not (steps := steps_of(agent)):
+                await asyncio.sleep(0.01)
+    ((index, step),) = steps.items()
+    at = [x for kind, k, x in log_of(agent) if (kind, k) == ("keyframe", index)]
+    assert at == [pytest.approx(-10.8)]
+    assert step.covariance.numpy()[0] == pytest.approx(np.pi**2)
+    assert "robot r1: its odometry jumped before 11.200 s" in caplog.text
+
+
+def steps_of(agent: Agent) -> dict[int, OdometryCovarianceRecord]:
+    records = agent.robot.gossip.logs[agent.log].records
+    return {record.index: record for record in records if isinstance(record, OdometryCovarianceRecord)}
 
 
 def test_a_mounting_that_is_no_pose_is_refused() -> None:
