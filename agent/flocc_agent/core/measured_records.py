@@ -123,8 +123,12 @@ class MeasuredRecords:
 
 
 def is_unmeasured(record: OdometryCovarianceRecord) -> bool:
-    """Whether odometry says nothing of a step: its rotation may be off by more than a radian."""
-    return float(record.covariance.numpy()[0]) > UNMEASURED_RAD**2
+    """Whether odometry says nothing of a step: its rotation may be off by over a radian about every axis.
+
+    A robot that drives in a plane may well know nothing of two of them.
+    """
+    rotation = symmetric(record.covariance.numpy())[:3, :3]
+    return float(np.linalg.eigvalsh(rotation)[0]) > UNMEASURED_RAD**2
 
 
 def _robots_of(log: LogId, record: Record) -> set[str]:

@@ -185,26 +185,30 @@ def breaks(stamps_s: Float, T: Float) -> NDArray[np.bool_]:
     moved_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
     turned_rad = np.arccos(np.clip(0.5 * (np.einsum("nij,nij->n", R[:-1], R[1:]) - 1.0), -1.0, 1.0))
 
-    def lonely(amount: Float, amount_min: float, rate_min: Float | float) -> NDArray[np.bool_]:
+    def beside(amount: Float) -> Float:
         rate = amount / step_s
-        beside = np.maximum(np.r_[0.0, rate[:-1]], np.r_[rate[1:], 0.0])
-        return np.asarray((amount > amount_min) & (rate > BREAK_RATIO * beside) & (rate - beside > rate_min))
+        return np.asarray(np.maximum(np.r_[0.0, rate[:-1]], np.r_[rate[1:], 0.0]))
 
-    inner = lonely(moved_m, BREAK_MIN_M, ACCELERATION_MAX_M_PER_S2 * step_s)
-    inner |= lonely(turned_rad, BREAK_MIN_RAD, TURN_MAX_RAD_S)
+    inner = _is_break(moved_m, turned_rad, step_s, beside(moved_m), beside(turned_rad))
     found[2:-1] = inner[1:-1]
     return found
 
 
 def is_break(moved_m: float, turned_rad: float, step_s: float, m_per_s: float, rad_per_s: float) -> bool:
     """Whether a step is one where odometry begins anew, by the speed of the step before alone."""
+    step = (np.array([value]) for value in (moved_m, turned_rad, step_s, m_per_s, rad_per_s))
+    return bool(_is_break(*step)[0])
 
-    def lonely(amount: float, amount_min: float, before: float, rate_min: float) -> bool:
+
+def _is_break(moved_m: Float, turned_rad: Float, step_s: Float, m_per_s: Float, rad_per_s: Float) -> NDArray[np.bool_]:
+    """Which steps (N,) are so, by the speeds beside each."""
+
+    def lonely(amount: Float, amount_min: float, beside: Float, rate_min: Float | float) -> NDArray[np.bool_]:
         rate = amount / step_s
-        return amount > amount_min and rate > BREAK_RATIO * before and rate - before > rate_min
+        return np.asarray((amount > amount_min) & (rate > BREAK_RATIO * beside) & (rate - beside > rate_min))
 
     moved = lonely(moved_m, BREAK_MIN_M, m_per_s, ACCELERATION_MAX_M_PER_S2 * step_s)
-    return moved or lonely(turned_rad, BREAK_MIN_RAD, rad_per_s, TURN_MAX_RAD_S)
+    return moved | lonely(turned_rad, BREAK_MIN_RAD, rad_per_s, TURN_MAX_RAD_S)
 
 
 def _is_number(value: object) -> bool:

@@ -35,7 +35,7 @@ from flocc_agent.runtime.straightening import Straightener
 from flocc_agent.runtime.text_tables import RecordingError, text_lines
 from flocc_agent.runtime.trajectory import GAP_MAX_S, Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import read_tum
-from flocc_agent.runtime.unmeasured_steps import pauses, unmeasured
+from flocc_agent.runtime.unmeasured_steps import pauses, together, unmeasured
 
 __all__ = ["Frame", "Recording", "RecordingError", "read_camera", "read_image_list", "write_camera"]
 
@@ -244,7 +244,8 @@ def _unmeasured(path: Path, odometry: Trajectory, frames_s: Sequence[float]) -> 
     for k, step in unmeasured(odometry.stamps_s, odometry.T_fixed_body).items():
         after = bisect_left(frames_s, float(odometry.stamps_s[k]))
         if 0 < after < len(frames_s):
-            found[frames_s[after]] = step
+            stamp_s = frames_s[after]
+            found[stamp_s] = together([found[stamp_s], step]) if stamp_s in found else step
     if len(paused := pauses(odometry.stamps_s)):
         from_s, to_s = odometry.stamps_s[paused[0] - 1], odometry.stamps_s[paused[0]]
         more = f" (and in {len(paused) - 1} other pauses)" if len(paused) > 1 else ""

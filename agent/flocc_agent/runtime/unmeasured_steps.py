@@ -6,6 +6,7 @@ covariance that lets loop closures decide. Where it was right after all, they sa
 """
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +65,11 @@ def after_jump(T_before: Float, T_after: Float) -> OdometryCovariance:
     return _covariance(ANYWHERE_RAD, JUMP_RATIO * float(np.linalg.norm(T_after[:3, 3] - T_before[:3, 3])))
 
 
+def together(steps: Sequence[OdometryCovariance]) -> OdometryCovariance:
+    """How exact odometry is over several such steps."""
+    return OdometryCovariance(np.sum([step.covariance for step in steps], axis=0))
+
+
 def _covariance(rotation_rad: float, translation_m: float) -> OdometryCovariance:
     sigmas = [min(rotation_rad, ANYWHERE_RAD)] * 3 + [min(max(translation_m, LEAST_M), ANYWHERE_M)] * 3
     return OdometryCovariance(np.diag(np.square(sigmas)))
@@ -105,7 +111,7 @@ class StepWatch:
     def of_keyframe(self, stamp_s: float) -> OdometryCovariance | None:
         """How exact odometry is to a keyframe from the one before; None where it was measured. Asked in their order."""
         is_first, self._has_keyframe = not self._has_keyframe, True
-        found: list[Float] = []
+        found: list[OdometryCovariance] = []
         while self._found and self._found[0][0] <= stamp_s:
-            found.append(self._found.popleft()[1].covariance)
-        return None if is_first or not found else OdometryCovariance(np.sum(found, axis=0))
+            found.append(self._found.popleft()[1])
+        return None if is_first or not found else together(found)
