@@ -210,6 +210,7 @@ AMOUNTS = {
     "mounting": " {0:.0f}\N{DEGREE SIGN}",
     "overlay": " {1:.0f} %",
     "frozen": " {0:.0f}",
+    "standing": " {0:.0f}",
 }
 
 
