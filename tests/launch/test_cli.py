@@ -47,9 +47,10 @@ def test_what_a_recording_has_to_say_is_said_once_in_a_command(
     def read_thrice() -> None:
         for name in ("odometry", "odometry", "images", "odometry"):
             logging.getLogger("flocc").warning("%s: says nothing from %.1f s to %.1f s", name, 1.0, 9.0)
+        sys.exit(0)
 
     monkeypatch.setattr(logging.root, "handlers", [])
-    monkeypatch.setattr("flocc_launch.commands.main.app", lambda *_, **__: (read_thrice(), sys.exit(0)))
+    monkeypatch.setattr("flocc_launch.commands.main.app", lambda *_, **__: read_thrice())
     assert run(monkeypatch, "simulate") == 0
     assert run(monkeypatch, "simulate") == 0, "the next command says it again"
     said = [f"{name}: says nothing from 1.0 s to 9.0 s" for name in ("odometry", "images")]
