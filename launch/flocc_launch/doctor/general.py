@@ -51,6 +51,7 @@ REASONS_LEFT = (
 
 
 SOLVER_ADVICE = {
+    "not along the way": "Look at odometry there first: wheels that slipped, a push, a robot that was blocked.",
     "measures lengths": "Calibrate what it takes lengths from: wheel radius, stereo baseline, camera height.",
     SECOND_PLACE: ADVICE,
     "held until another one agrees": "If it is right, pass the place again; if not, nothing is to be done.",
