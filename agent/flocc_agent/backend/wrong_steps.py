@@ -37,8 +37,8 @@ def wrong_step_warnings(problem: Problem, solved: Solved) -> tuple[str, ...]:
         return ()
     where = " and ".join(f"{KeyframeId(log, first)} to {KeyframeId(log, last)}" for log, first, last in found)
     return (
-        f"what does not fit lies at {where}, not along the way: odometry that is wrong there, as of wheels that slip or "
-        "a robot that was pushed, looks like a wrong scale of the whole way",
+        f"what does not fit lies at {where}, not along the way: odometry that is wrong there, as of wheels that "
+        "slip or a robot that was pushed, looks like a wrong scale of the whole way",
     )
 
 

@@ -1,4 +1,4 @@
-"""A wrong stretch of odometry that looks like a wrong scale is named where it is, and a wrong scale is not called one."""
+"""A wrong stretch of odometry that looks like a wrong scale is named where it is; a wrong scale is not called one."""
 
 import re
 
