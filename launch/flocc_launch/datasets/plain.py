@@ -15,14 +15,16 @@ from flocc_agent.runtime.stamp_units import are_counted, plausible_units
 from flocc_agent.runtime.text_tables import is_number, text_lines
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
-from flocc_launch.datasets.files import camera_file, image_files, listed_images, some, unequal
+from flocc_launch.datasets.files import camera_file, camera_files, image_files, listed_images, some, unequal
 from flocc_launch.datasets.source import DatasetError, Lens, Source
 from flocc_launch.datasets.stamped_names import stamps_of_names
 
 Stamped = tuple[tuple[float, Path], ...]
 
+NAMED_ODOMETRY = ("odometry", "odom", "vio")
+"""Names of files that say that they are odometry: those count before a trajectory or poses, which may be anything."""
 ODOMETRY_STEMS = (
-    "odometry", "trajectory", "poses", "vio", "odom", "camera_poses", "arcore_poses", "arkit_poses", "arcore", "arkit",
+    *NAMED_ODOMETRY, "trajectory", "poses", "camera_poses", "arcore_poses", "arkit_poses", "arcore", "arkit",
     "arposes",
 )  # fmt: skip
 TRUTH_STEMS = ("groundtruth", "gt", "ground_truth")
@@ -34,6 +36,8 @@ TIMES = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
 """Stamps of images whose names only count, one a line, or behind the image's number or before or behind its name."""
 OF_PHONES = ("arcore", "arkit", "arposes")
 PHONE_AXES = "T_body_camera = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]"
+BESIDE_READ = ("plain", "euroc", "kitti-raw")
+"""Data sets whose reader takes any trajectory beside them; of others only what is called odometry counts."""
 TRAJECTORY_SUFFIXES = (".tum", ".txt", ".csv")
 BY_ORDER = "the names of the images were taken to count them only: each has the stamp of the pose in the same place"
 UNUSUAL = ("dates, read as UTC", "seconds and their fraction", *(f"{name} gives them" for name in TIMES))
@@ -71,7 +75,7 @@ def read_plain(path: Path, form: str | None = None) -> Source:
     notes = (*read_how, *notes)
     return Source(
         path, "plain", images, lens, odometry=odometry, truth=truth, faults=faults, notes=notes,
-        is_posed_by_image=by_order,
+        is_posed_by_image=by_order, calibrations=tuple(camera_files(path)),
     )  # fmt: skip
 
 
@@ -98,6 +102,11 @@ def trajectories_beside(
     odometry, notes = _first_trajectory(path, ODOMETRY_STEMS, form, stamps_s)
     truth, truth_notes = _first_trajectory(path, TRUTH_STEMS, form, stamps_s)
     return odometry, truth, (*notes, *truth_notes)
+
+
+def odometry_stems(format_name: str) -> tuple[str, ...]:
+    """Names of files that are taken as odometry beside a data set of a format."""
+    return ODOMETRY_STEMS if format_name in BESIDE_READ else NAMED_ODOMETRY
 
 
 def expected_files(path: Path) -> str:

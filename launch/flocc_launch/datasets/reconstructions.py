@@ -19,7 +19,7 @@ from flocc_agent.runtime.text_tables import is_number, numbered_lines, read_text
 from flocc_agent.runtime.trajectory import Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.colmap_order import SEEN_MAX, contradicted, read_points, seen_in
-from flocc_launch.datasets.files import image_files, listed_file, natural
+from flocc_launch.datasets.files import camera_file, camera_files, image_files, listed_file, natural
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import size_of
 from flocc_launch.datasets.source import DatasetError, Lens, Source
@@ -92,10 +92,16 @@ def read_colmap(path: Path) -> Source:
         )
     if len(used) > 1:
         raise DatasetError(f"{place / 'images.txt'}: images are of {len(used)} cameras; flocc takes one")
-    lens = read_lens(place / f"cameras.txt#{next(iter(used))}")
+    own = place / f"cameras.txt#{next(iter(used))}"
+    lens = read_lens(own)
     _refuse_other_order(place, images, seen, lens)
     source = _source(path, "colmap", _image_folder(path), poses, lens)
-    return replace(source, notes=(*source.notes, *_cut_rows(file, cut, len(poses)), *_other_models(path, place)))
+    transforms = [path / "transforms.json"] if (path / "transforms.json").exists() else []
+    return replace(
+        source,
+        notes=(*source.notes, *_cut_rows(file, cut, len(poses)), *_other_models(path, place)),
+        calibrations=(own, *(each for each in camera_files(path) if each != place / "cameras.txt"), *transforms),
+    )
 
 
 def _other_models(path: Path, place: Path) -> list[str]:
@@ -220,7 +226,8 @@ def read_transforms(path: Path) -> Source:
     scaled = f"{file}: applied_scale is {scale:g}; distances are those before it, the poses' divided by it"
     unused = sorted({key for f in frames for key in f} - FRAME_KEYS)
     told = f"{file}: not used of its frames: {', '.join(unused[:12])}"
-    return replace(source, notes=(*source.notes, *([scaled] if scale != 1.0 else []), *([told] if unused else [])))
+    notes = (*source.notes, *([scaled] if scale != 1.0 else []), *([told] if unused else []))
+    return replace(source, notes=notes, calibrations=(file, *camera_files(path)))
 
 
 def _applied_scale(table: dict[str, Any], file: Path) -> float:
@@ -325,8 +332,12 @@ def read_replica(path: Path) -> Source:
     files = [file for file in image_files(path / "results") if file.stem.startswith("frame")]
     stamps_s = [k / REPLICA_RATE_HZ for k in range(len(files))]
     truth, notes = read_trajectory(path / "traj.txt", "kitti", stamps_s)
-    place = next((p for p in (path / "cam_params.json", path.parent / "cam_params.json") if p.exists()), None)
-    lens = None if place is None else read_lens(place)
-    told = f"{path}: images have no stamps; {REPLICA_RATE_HZ:g} a second were assumed"
     images = tuple(zip(stamps_s, files, strict=True))
-    return Source(path, "replica", images, lens, truth=truth, notes=(told, *notes), is_posed_by_image=True)
+    place = next((p for p in (path / "cam_params.json", path.parent / "cam_params.json") if p.exists()), None)
+    lens = camera_file(path, images) if place is None else read_lens(place)
+    calibrations = (*([] if place is None else [place]), *camera_files(path))
+    told = f"{path}: images have no stamps; {REPLICA_RATE_HZ:g} a second were assumed"
+    return Source(
+        path, "replica", images, lens, truth=truth, notes=(told, *notes), is_posed_by_image=True,
+        calibrations=calibrations,
+    )  # fmt: skip
