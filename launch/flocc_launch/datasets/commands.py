@@ -29,6 +29,7 @@ from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.unread import unused
 from flocc_launch.datasets.video import (
     WHAT_ODOMETRY,
+    beside_notes,
     convert_video,
     is_video,
     lens_beside,
@@ -259,6 +260,7 @@ def _video_info(path: Path) -> Info:
         truth_poses=None,
         length_m=None if trajectory is None else trajectory.length_m(),
         faults=tuple(lacks),
+        notes=tuple(beside_notes(path)),
     )
 
 

@@ -211,7 +211,8 @@ def read_source(
     source = _read(path, name, form)
     if odometry is None:
         source = _with_odometry_beside(source, form)
-    see_one_trajectory(source.truth, trajectory_files(path, TRUTH_STEMS), form, source)
+    stamps_s = [stamp_s for stamp_s, _ in source.images]
+    see_one_trajectory(source.truth, trajectory_files(path, TRUTH_STEMS), form, stamps_s)
     if camera is None:
         source = replace(source, notes=(*source.notes, *see_one_camera(source)))
     lens = source.lens if camera is None else read_lens(camera, size_of(source.images))
@@ -232,10 +233,11 @@ def _with_odometry_beside(source: Source, form: str | None) -> Source:
         DatasetError: Two files of odometry tell different motions.
     """
     files = trajectory_files(source.path, odometry_stems(source.format))
+    stamps_s = [stamp_s for stamp_s, _ in source.images]
     if source.odometry is None and source.format not in BESIDE_READ and files:
-        odometry, notes = read_trajectory(files[0], form, [stamp_s for stamp_s, _ in source.images])
+        odometry, notes = read_trajectory(files[0], form, stamps_s)
         source = replace(source, odometry=odometry, notes=(*source.notes, *notes))
-    see_one_trajectory(source.odometry, files, form, source)
+    see_one_trajectory(source.odometry, files, form, stamps_s)
     return source
 
 

@@ -40,6 +40,11 @@ FRAME_KEYS = {
     "fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model", "camera_angle_x",
 }  # fmt: skip
 """What a frame of transforms.json says that is used, or that says nothing of poses, lenses and stamps."""
+AXES_KEY = re.compile(r"conven|coord|axes|handed|world_?(to|2)_?cam|w2c|pose_?(type|format)")
+AXES_READ = re.compile(
+    r"open_?gl|blender|nerf|c2w|cam(era)?_?(to|2)_?world|(w2c|world_?(to|2)_?cam\w*) false|handed\w* right"
+)
+"""Keys of transforms.json that name a convention of its poses, and what they say of the one that is read."""
 COLMAP_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap_text")
 
 
@@ -218,6 +223,7 @@ def read_transforms(path: Path) -> Source:
     if wrong is not None:
         raise DatasetError(f"{file}: the transform_matrix of {wrong} is not 4x4")
     world = {name: checked_pose(T @ CAMERA_OF_OPENGL, f"{file}: {name}") for name, T in poses.items()}
+    _refuse_other_axes(table, file)
     scale = _applied_scale(table, file)
     for T in world.values():
         T[:3, 3] /= scale
@@ -228,6 +234,21 @@ def read_transforms(path: Path) -> Source:
     told = f"{file}: not used of its frames: {', '.join(unused[:12])}"
     notes = (*source.notes, *([scaled] if scale != 1.0 else []), *([told] if unused else []))
     return replace(source, notes=notes, calibrations=(file, *camera_files(path)))
+
+
+def _refuse_other_axes(table: dict[str, Any], file: Path) -> None:
+    """Refuse poses that the file itself says are of other axes, or of the world in the camera.
+
+    Raises:
+        DatasetError: A key that names a convention names another one than OpenGL's camera in the world.
+    """
+    for key, value in table.items():
+        text = f"{key} {value}".lower()
+        if AXES_KEY.search(key.lower()) and value not in (None, "") and not AXES_READ.search(text):
+            raise DatasetError(
+                f"{file}: {key} is {str(value)[:40]!r}, but poses are read as those of a camera in the world, in "
+                "OpenGL's axes (y up, z backwards): write them so, and take the key out"
+            )
 
 
 def _applied_scale(table: dict[str, Any], file: Path) -> float:

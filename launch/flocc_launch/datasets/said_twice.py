@@ -16,7 +16,7 @@ from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import size_of
-from flocc_launch.datasets.plain import NAMED_ODOMETRY
+from flocc_launch.datasets.plain import NAMED_ODOMETRY, ODOMETRY_STEMS, TRUTH_STEMS
 from flocc_launch.datasets.source import DatasetError, Float, Lens, Source
 from flocc_protocol.errors import FloccError
 
@@ -93,23 +93,24 @@ def _drawn(camera: CameraModel, rays: Float) -> tuple[Float, NDArray[np.bool_]]:
     return np.asarray(pixels[:, 0], dtype=float), np.ones(len(rays), dtype=bool)
 
 
-def see_one_trajectory(taken: Trajectory | None, files: Sequence[Path], form: str | None, source: Source) -> None:
+def see_one_trajectory(
+    taken: Trajectory | None, files: Sequence[Path], form: str | None, stamps_s: Sequence[float]
+) -> None:
     """See that trajectories of one name and meaning tell one motion.
 
     Args:
         taken: What was read of the first file.
         files: That one and the others, in the order in which they count.
         form: Of the files; None finds out.
-        source: The data set, whose images stamp poses that have no stamps.
+        stamps_s: Of the images, for poses that have no stamps.
 
     Raises:
         DatasetError: One tells another motion.
     """
     if taken is None or len(files) < 2:
         return
-    stamps_s = [stamp_s for stamp_s, _ in source.images]
     for file in files[1:]:
-        if (file.stem.lower() in NAMED_ODOMETRY) != (files[0].stem.lower() in NAMED_ODOMETRY):
+        if _rank(file) != _rank(files[0]):
             continue
         try:
             other, _ = read_trajectory(file, form, stamps_s)
@@ -120,6 +121,12 @@ def see_one_trajectory(taken: Trajectory | None, files: Sequence[Path], form: st
                 f"{files[0]} and {file.name} tell different motions ({how}): keep the one that counts under that name, "
                 "or name it with flocc dataset convert --odometry"
             )
+
+
+def _rank(file: Path) -> str:
+    """What a file's name says of it: names of one rank mean the same thing, and one of another rank is told."""
+    stem = file.stem.lower()
+    return "odometry" if stem in NAMED_ODOMETRY else "perhaps" if stem in (*ODOMETRY_STEMS, *TRUTH_STEMS) else stem
 
 
 def motions_differ(taken: Trajectory, other: Trajectory) -> str | None:
