@@ -15,9 +15,10 @@ from flocc_launch.datasets.commands import convert, info
 from flocc_launch.datasets.detect import read_source
 from flocc_launch.datasets.said_twice import cameras_differ, motions_differ
 from flocc_launch.datasets.source import DatasetError, Lens
+from flocc_launch.datasets.unread import unused
 
 CAMERA = "width: 64\nheight: 48\nfx: 60\nfy: 60\ncx: 32\ncy: 24\n"
-STAMPS_S = 1_700_000_000 + 0.25 * np.arange(8)
+STAMPS_S = np.linspace(1_700_000_000, 1_700_000_001.75, 8)
 T = np.array([pose(so3_exp(np.array([0.0, 0.1, 0.1 * k])), np.array([3.0 + 0.2 * k, 2.0, 0.5])) for k in range(8)])
 MOTION = Trajectory(STAMPS_S, T)
 OTHER = Trajectory(STAMPS_S, T @ pose(so3_exp(np.array([0.0, 0.0, 0.5])), np.array([0.3, 0.1, 0.0])))
@@ -126,3 +127,30 @@ def test_a_motion_is_the_same_in_another_frame_and_of_some_of_its_poses() -> Non
     )
     assert motions_differ(MOTION, elsewhere) is None
     assert motions_differ(MOTION, MOTION.later(100.0)) == "they have no time in common"
+
+
+def test_a_published_data_set_names_what_its_reader_passes_over_and_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "image_0").mkdir()
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / "image_0" / f"{k:06d}.png"), np.full((48, 64, 3), 20 * k, np.uint8))
+    (tmp_path / "poses.txt").write_text("".join(f"1 0 0 {k} 0 1 0 0 0 0 1 0\n" for k in range(3)))
+    (tmp_path / "calib.txt").write_text("P0: 60 0 32 0 0 60 24 0 0 0 1 0\n")
+    write_tum(tmp_path / "odometry.tum", Trajectory(np.array([0.0, 0.1, 0.2]), T[:3]))
+    write_tum(tmp_path / "trajectory.tum", MOTION)
+    source = read_source(tmp_path)
+    assert (source.format, unused(source)) == ("kitti", (f"{tmp_path}: not used: trajectory.tum",))
+    (tmp_path / "camera.yaml").write_text(CAMERA.replace("cx: 32", "cx: 30"))
+    with pytest.raises(DatasetError, match=r"camera.yaml and calib.txt#P0 describe different cameras"):
+        read_source(tmp_path)
+
+
+def test_two_files_of_stamps_that_differ_are_refused(tmp_path: Path) -> None:
+    path = folder(tmp_path / "data")
+    for k, image in enumerate(sorted((path / "images").iterdir())):
+        image.rename(image.with_name(f"{k:04d}.png"))
+    (path / "times.txt").write_text("".join(f"{stamp_s:.2f}\n" for stamp_s in STAMPS_S))
+    (path / "timestamps.csv").write_text("".join(f"{k:04d}.png,{1e9 * s:.0f}\n" for k, s in enumerate(STAMPS_S)))
+    assert [stamp_s for stamp_s, _ in read_source(path).images] == pytest.approx(STAMPS_S)
+    (path / "timestamps.csv").write_text("".join(f"{stamp_s + 0.1:.2f}\n" for stamp_s in STAMPS_S))
+    with pytest.raises(DatasetError, match=r"times.txt and timestamps.csv give the images different stamps"):
+        read_source(path)

@@ -218,8 +218,8 @@ def read_source(
     lens = source.lens if camera is None else read_lens(camera, size_of(source.images))
     source = _of_body_clock(replace(source, lens=lens))
     if time_offset_s:
-        odometry, truth = (t.later(time_offset_s) if t is not None else None for t in (source.odometry, source.truth))
-        source = replace(source, odometry=odometry, truth=truth)
+        moved, truth = (t.later(time_offset_s) if t is not None else None for t in (source.odometry, source.truth))
+        source = replace(source, odometry=moved, truth=truth)
     for trajectory in (source.odometry, source.truth):
         if trajectory is not None and time_offset_s is not None:
             check_times(source, trajectory)

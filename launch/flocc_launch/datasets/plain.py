@@ -34,6 +34,7 @@ IMAGE_FOLDERS = (
 )  # fmt: skip
 TIMES = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
 """Stamps of images whose names only count, one a line, or behind the image's number or before or behind its name."""
+STAMPS_APART_MAX_S = 1e-3
 OF_PHONES = ("arcore", "arkit", "arposes")
 PHONE_AXES = "T_body_camera = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]"
 BESIDE_READ = ("plain", "euroc", "kitti-raw")
@@ -160,8 +161,10 @@ def _named_images(path: Path) -> tuple[Stamped | None, tuple[str, ...], str]:
     folder = _image_folder(path)
     files = some(tuple(image_files(folder)), folder)
     stamps_s, how = stamps_of_names([file.stem for file in files], folder)
-    if stamps_s is None and (times := next((path / t for t in TIMES if (path / t).is_file()), None)) is not None:
-        stamps_s, how = stamps_of_times(times, files), f"{times.name} gives them"
+    times = [path / name for name in TIMES if (path / name).is_file()]
+    if stamps_s is None and times:
+        stamps_s, how = stamps_of_times(times[0], files), f"{times[0].name} gives them"
+        _see_one_time(times, stamps_s, files)
     if stamps_s is None:
         return None, (), how
     pairs = sorted(zip(stamps_s, files, strict=True))
@@ -171,6 +174,24 @@ def _named_images(path: Path) -> tuple[Stamped | None, tuple[str, ...], str]:
             f"{twins[1]}: has the stamp of another image, {twins[0]:.6f} s; a folder holds the images of one camera"
         )
     return tuple(pairs), (), how
+
+
+def _see_one_time(times: Sequence[Path], stamps_s: Sequence[float], files: Sequence[Path]) -> None:
+    """See that other files of stamps that are as many say the same.
+
+    Raises:
+        DatasetError: One does not.
+    """
+    for other in times[1:]:
+        try:
+            said_s = stamps_of_times(other, files)
+        except DatasetError:  # of something else: it is told that it was not used
+            continue
+        if not np.allclose(said_s, stamps_s, rtol=0.0, atol=STAMPS_APART_MAX_S):
+            raise DatasetError(
+                f"{times[0]} and {other.name} give the images different stamps, {stamps_s[0]:.6f} s and "
+                f"{said_s[0]:.6f} s to the first: keep the one that counts"
+            )
 
 
 def stamps_of_times(path: Path, files: Sequence[Path]) -> list[float]:

@@ -46,7 +46,7 @@ def unused(source: Source, *given: Path | None) -> tuple[str, ...]:
     used = {file.relative_to(root).parts[0] for _, file in source.images if file.is_relative_to(root)}
     used |= {file.name for file in given if file is not None and file.parent.resolve() == root.resolve()}
     used |= set(OF_RECORDINGS) | {
-        file.relative_to(root).parts[0] for file in source.calibrations if root in file.parents
+        file.relative_to(root).parts[0].partition("#")[0] for file in source.calibrations if root in file.parents
     }
     if source.format == "plain":
         used |= _taken_by_plain(root)
