@@ -212,7 +212,7 @@ def read_source(
     if odometry is None:
         source = _with_odometry_beside(source, form)
     stamps_s = [stamp_s for stamp_s, _ in source.images]
-    see_one_trajectory(source.truth, trajectory_files(path, TRUTH_STEMS), form, stamps_s)
+    see_one_trajectory(source.truth, trajectory_files(path, TRUTH_STEMS), form, stamps_s, way_out="")
     if camera is None:
         source = replace(source, notes=(*source.notes, *see_one_camera(source)))
     lens = source.lens if camera is None else read_lens(camera, size_of(source.images))

@@ -62,8 +62,9 @@ def cameras_differ(taken: Lens, other: Lens) -> str | None:
         return f"of {a.width}x{a.height} and of {b.width}x{b.height} pixels"
     apart_px = _drawn_apart_px(a, b)
     if not apart_px <= APART_MAX_RATIO * max(a.width, a.height):
-        numbers = f"fx {a.fx:g} and {b.fx:g}, {a.kind} and {b.kind}"
-        return f"{numbers}; they draw points up to {apart_px:.2g} pixels apart"
+        said = (("", str(a.kind), str(b.kind)), ("fx ", f"{a.fx:g}", f"{b.fx:g}"), ("fy ", f"{a.fy:g}", f"{b.fy:g}"))
+        unlike = [f"{name}{one} and {two}" for name, one, two in said if one != two] or ["other centres or distortion"]
+        return f"{', '.join(unlike)}; they draw points up to {apart_px:.2g} pixels apart"
     apart = taken.T_body_camera - other.T_body_camera
     is_apart = np.abs(apart[:3, 3]).max() > MOUNTED_APART_MAX_M or np.abs(apart[:3, :3]).max() > MOUNTED_APART_MAX
     if is_apart and not np.array_equal(other.T_body_camera, np.eye(4)):
@@ -94,7 +95,11 @@ def _drawn(camera: CameraModel, rays: Float) -> tuple[Float, NDArray[np.bool_]]:
 
 
 def see_one_trajectory(
-    taken: Trajectory | None, files: Sequence[Path], form: str | None, stamps_s: Sequence[float]
+    taken: Trajectory | None,
+    files: Sequence[Path],
+    form: str | None,
+    stamps_s: Sequence[float],
+    way_out: str = ", or name it with flocc dataset convert --odometry",
 ) -> None:
     """See that trajectories of one name and meaning tell one motion.
 
@@ -103,6 +108,7 @@ def see_one_trajectory(
         files: That one and the others, in the order in which they count.
         form: Of the files; None finds out.
         stamps_s: Of the images, for poses that have no stamps.
+        way_out: What the sentence ends in.
 
     Raises:
         DatasetError: One tells another motion.
@@ -118,8 +124,7 @@ def see_one_trajectory(
             continue
         if (how := motions_differ(taken, other)) is not None:
             raise DatasetError(
-                f"{files[0]} and {file.name} tell different motions ({how}): keep the one that counts under that name, "
-                "or name it with flocc dataset convert --odometry"
+                f"{files[0]} and {file.name} tell different motions ({how}): keep the one that counts{way_out}"
             )
 
 
