@@ -188,9 +188,11 @@ def test_axes_that_were_found_wrong_stay_so_as_long_as_they_explain_more() -> No
     first = camera_verdict(pairs[:5])
     assert first is not None
     assert camera_verdict(pairs) is None
-    later = camera_verdict(pairs, first.fault)
-    assert later is not None
-    assert later.places_wrongly
+    for fault in (first.fault, CameraFault.MIRRORED):
+        later = camera_verdict(pairs, fault)
+        assert later is not None
+        assert later.fault is fault
+        assert later.places_wrongly
 
 
 def test_a_robot_that_only_drives_straight_shows_no_focal_length() -> None:

@@ -246,9 +246,11 @@ def _named(found: _Explanation, nothing: _Explanation) -> CameraVerdict | None:
 def _other_axes(tried: Sequence[_Explanation], known: CameraFault | None) -> CameraVerdict | None:
     """Axes that leave far less than those that are configured, however much that is.
 
-    Of axes that leave as much, the simplest: in a plane a mirrored camera moves as one does that hangs upside down.
+    Of axes that leave as much, those that are known, or the simplest: in a plane a mirrored camera moves as one does
+    that hangs upside down.
     """
     axes = [each for each in tried if each.fault in AXES and _are_other(each)]
+    axes.sort(key=lambda each: each.fault is not known)
     least = min((trimmed(each.left) for each in axes), default=0.0)
     simplest = next((each for each in axes if FAR_LESS_RATIO * trimmed(each.left) <= least), None)
     if simplest is None or simplest.fault is None or simplest.X is None:
