@@ -18,6 +18,7 @@ from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
 from flocc_launch.datasets.bag_layout import Layout
 from flocc_launch.datasets.bag_messages import IMAGE_TYPES
 from flocc_launch.datasets.bag_reader import Bag, is_bag
+from flocc_launch.datasets.clock_check import clock_faults
 from flocc_launch.datasets.clocks import ClockFit, measured
 from flocc_launch.datasets.cut import cut
 from flocc_launch.datasets.detect import check_times, not_taken, read_source, team_folder
@@ -506,14 +507,16 @@ def _see_pictures(source: Source, given: Trajectory | None, is_settled: bool) ->
     """
     trajectory = given or source.odometry or source.truth
     if trajectory is not None:
-        _log(seen_faults(source, trajectory, is_settled))
+        _log((*seen_faults(source, trajectory, is_settled), *clock_faults(source, trajectory)))
 
 
 def _seen(source: Source, is_settled: bool) -> tuple[str, ...]:
     """The same in sentences, where nothing is converted."""
     trajectory = source.odometry or source.truth
     try:
-        return () if trajectory is None else seen_faults(source, trajectory, is_settled)
+        if trajectory is None:
+            return ()
+        return (*seen_faults(source, trajectory, is_settled), *clock_faults(source, trajectory))
     except DatasetError as error:
         return (str(error),)
 
