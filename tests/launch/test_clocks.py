@@ -11,10 +11,10 @@ from flocc_agent.geometry import pose, so3_exp
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
-from flocc_launch.datasets.clock_check import clock_faults, offset_s, turning_stretch
 from flocc_launch.datasets.clocks import fit_clocks
 from flocc_launch.datasets.commands import clock, convert
 from flocc_launch.datasets.source import DatasetError, Source
+from flocc_launch.datasets.truth_clock import offset_s, truth_faults, turning_stretch
 
 Float = NDArray[np.float64]
 
@@ -78,8 +78,8 @@ def test_ground_truth_of_another_clock_is_told_before_anything_is_measured_again
     bent = own.T_fixed_body @ pose(so3_exp(np.array([0.02, 0.0, 0.1])), np.array([0.5, 0.0, 0.0]))
     truth = Trajectory(own.stamps_s + late_s, bent)
     source = Source(Path("field"), "plain", tuple((k / 5, Path(f"{k}.jpg")) for k in range(300)), None, own, truth)
-    sentence = "field: the ground truth turns 1.50 s too late for the odometry: its stamps are of another clock"
-    assert [told.startswith(sentence) for told in clock_faults(source, own)] == ([True] if late_s else [])
+    sentence = "field: the ground truth turns 1.50 s too late for the odometry: one of them is of another clock"
+    assert [told.startswith(sentence) for told in truth_faults(source, own)] == ([True] if late_s else [])
 
 
 def test_an_even_turn_does_not_tell() -> None:

@@ -18,7 +18,6 @@ from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
 from flocc_launch.datasets.bag_layout import Layout
 from flocc_launch.datasets.bag_messages import IMAGE_TYPES
 from flocc_launch.datasets.bag_reader import Bag, is_bag
-from flocc_launch.datasets.clock_check import clock_faults
 from flocc_launch.datasets.clocks import ClockFit, measured
 from flocc_launch.datasets.cut import cut
 from flocc_launch.datasets.detect import check_times, not_taken, read_source, team_folder
@@ -27,9 +26,11 @@ from flocc_launch.datasets.names import robot_names
 from flocc_launch.datasets.picture_check import seen_faults
 from flocc_launch.datasets.plain import ODOMETRY_STEMS, TRUTH_STEMS, expected_files, taken_file
 from flocc_launch.datasets.source import DatasetError, Source
+from flocc_launch.datasets.truth_clock import truth_faults
 from flocc_launch.datasets.unread import unused
 from flocc_launch.datasets.video import (
     WHAT_ODOMETRY,
+    beside_notes,
     convert_video,
     is_video,
     lens_beside,
@@ -260,6 +261,7 @@ def _video_info(path: Path) -> Info:
         truth_poses=None,
         length_m=None if trajectory is None else trajectory.length_m(),
         faults=tuple(lacks),
+        notes=tuple(beside_notes(path)),
     )
 
 
@@ -293,7 +295,7 @@ def clock(path: Path, odometry: Path | None = None, camera: Path | None = None, 
     Raises:
         DatasetError: There is no trajectory or calibration, or the pictures do not tell.
     """
-    source = read_source(path, None, camera, form if odometry is None else None, time_offset_s=None)
+    source = read_source(path, None, camera, form if odometry is None else None, None, odometry)
     trajectory = source.odometry or source.truth if odometry is None else read_trajectory(odometry, form)[0]
     if trajectory is None:
         raise DatasetError(f"{path}: has neither odometry nor ground truth ({expected_files(path)})")
@@ -381,7 +383,7 @@ def convert(
             logger.warning("%s", note)
         return out
     own_form = form if odometry is None else None
-    source = _viewed(read_source(path, format_name, camera, own_form, time_offset_s), view_deg)
+    source = _viewed(read_source(path, format_name, camera, own_form, time_offset_s, odometry), view_deg)
     _tell(source, camera, odometry)
     identity = _identity(
         f"convert time_offset_s={time_offset_s}" if time_offset_s else "convert", path, source, drift, seed
@@ -507,7 +509,7 @@ def _see_pictures(source: Source, given: Trajectory | None, is_settled: bool) ->
     """
     trajectory = given or source.odometry or source.truth
     if trajectory is not None:
-        _log((*seen_faults(source, trajectory, is_settled), *clock_faults(source, trajectory)))
+        _log((*seen_faults(source, trajectory, is_settled), *truth_faults(source, trajectory)))
 
 
 def _seen(source: Source, is_settled: bool) -> tuple[str, ...]:
@@ -516,7 +518,7 @@ def _seen(source: Source, is_settled: bool) -> tuple[str, ...]:
     try:
         if trajectory is None:
             return ()
-        return (*seen_faults(source, trajectory, is_settled), *clock_faults(source, trajectory))
+        return (*seen_faults(source, trajectory, is_settled), *truth_faults(source, trajectory))
     except DatasetError as error:
         return (str(error),)
 
