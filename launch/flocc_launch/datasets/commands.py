@@ -26,6 +26,7 @@ from flocc_launch.datasets.names import robot_names
 from flocc_launch.datasets.picture_check import seen_faults
 from flocc_launch.datasets.plain import ODOMETRY_STEMS, TRUTH_STEMS, expected_files, taken_file
 from flocc_launch.datasets.source import DatasetError, Source
+from flocc_launch.datasets.truth_clock import truth_faults
 from flocc_launch.datasets.unread import unused
 from flocc_launch.datasets.video import (
     WHAT_ODOMETRY,
@@ -508,14 +509,16 @@ def _see_pictures(source: Source, given: Trajectory | None, is_settled: bool) ->
     """
     trajectory = given or source.odometry or source.truth
     if trajectory is not None:
-        _log(seen_faults(source, trajectory, is_settled))
+        _log((*seen_faults(source, trajectory, is_settled), *truth_faults(source, trajectory)))
 
 
 def _seen(source: Source, is_settled: bool) -> tuple[str, ...]:
     """The same in sentences, where nothing is converted."""
     trajectory = source.odometry or source.truth
     try:
-        return () if trajectory is None else seen_faults(source, trajectory, is_settled)
+        if trajectory is None:
+            return ()
+        return (*seen_faults(source, trajectory, is_settled), *truth_faults(source, trajectory))
     except DatasetError as error:
         return (str(error),)
 
