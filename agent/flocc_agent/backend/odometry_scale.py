@@ -19,7 +19,7 @@ from flocc_agent.backend.edges import State, residuals
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.mapped import SavedLog
 from flocc_agent.backend.posing import Posed
-from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, continued, explains, solve, solve_once
+from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, continued, explains, searching, solve, solve_once
 from flocc_agent.config import Formulation, Solver
 from flocc_agent.core.pose_graph import Component, GraphSolution, OdometryScale, is_landmark
 from flocc_protocol.ids import LogId
@@ -277,7 +277,7 @@ def takes_in(before: SolvedWithScales, applied: SolvedWithScales) -> bool:
     lost = np.count_nonzero(before.used) - np.count_nonzero(applied.used)
     if lost <= 0:
         return True
-    price = 0.5 * float(np.max(before.posed.objective.bounds()))
+    price = 0.5 * float(np.max(searching(before.posed.objective).bounds()))
     return applied.penalised_cost() + lost * price < before.penalised_cost()
 
 

@@ -20,6 +20,7 @@ from scipy.sparse.linalg import splu
 from flocc_agent.backend.alignment import evenly
 from flocc_agent.backend.descent import Objective
 from flocc_agent.backend.edges import State, jacobians, residuals, taken
+from flocc_agent.backend.linear import SingularSystem
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -59,7 +60,10 @@ def passages(objective: Objective, state: State, chosen: Bool, votes: Float, gro
         return
     saved = np.array([0.5 * (votes * objective.bounds())[members].sum() for members in found])
     asked = [objective.closures.start + evenly(np.flatnonzero(members), ASKED_MAX) for members in found]
-    costs = added_costs(objective, state, objective.weights(chosen.astype(float)), asked)
+    try:
+        costs = added_costs(objective, state, objective.weights(chosen.astype(float)), asked)
+    except SingularSystem:
+        return
     promising = np.flatnonzero(costs <= SLACK * saved)
     for n in promising[np.argsort((costs - saved)[promising], kind="stable")][:TRIED_MAX].tolist():
         yield found[n]
@@ -76,6 +80,9 @@ def added_costs(objective: Objective, state: State, weights: Float, groups: Sequ
 
     Returns:
         (K,) one cost of each group.
+
+    Raises:
+        SingularSystem: The factorisation fails.
     """
     hold, fixed = objective.has_directions, 6 * objective.linear.fixed
     moving = np.delete(np.arange(6 * len(state.q) + len(state.scale)), np.arange(fixed, fixed + 6))
@@ -85,7 +92,10 @@ def added_costs(objective: Objective, state: State, weights: Float, groups: Sequ
     sigma = np.broadcast_to(objective.linear.scale_prior_sigma, state.scale.shape)
     prior = np.concatenate([np.full(len(moving) - len(state.scale), TETHER), 1.0 / sigma**2])
     H = csc_array(A.T @ by_edge @ A + diags_array(prior))
-    factors = splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    try:
+        factors = splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    except RuntimeError as error:
+        raise SingularSystem(str(error)) from error
     costs = []
     for group in groups:
         J = _jacobian(objective, state, group, hold)[:, moving]
