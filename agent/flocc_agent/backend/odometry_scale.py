@@ -278,7 +278,7 @@ def takes_in(before: SolvedWithScales, applied: SolvedWithScales) -> bool:
     if lost <= 0:
         return True
     price = 0.5 * float(np.max(searching(before.posed.objective).bounds()))
-    return applied.penalised_cost() + lost * price < before.penalised_cost()
+    return bool(applied.penalised_cost() + lost * price < before.penalised_cost())
 
 
 def relative_to_mean(scale: Float, covariance: Float) -> tuple[Float, Float]:

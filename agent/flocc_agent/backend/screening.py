@@ -166,27 +166,25 @@ def _missing(keyframe: KeyframeId, trajectories: Mapping[LogId, Trajectory]) -> 
 
 
 def _duplicates(closures: Sequence[LoopClosure], excluded: Mapping[int, str]) -> dict[int, str]:
-    """Exclude closures of one pair that repeat a better one, or contradict one whose match ratio is higher.
+    """Exclude all but the best closure of each pair: the highest match ratio, then the first.
 
-    Better is the higher match ratio, then the first. Of two that are as good and contradict each other nobody knows
-    which is right: both count, and the solver decides. Metric closures with a covariance of their own are measurements
-    in their own right: every one counts.
+    Metric closures with a covariance of their own are measurements in their own right: every one counts.
     """
-    kept: dict[tuple[KeyframeId, KeyframeId], list[int]] = {}
+    best: dict[tuple[KeyframeId, KeyframeId], int] = {}
     reasons: dict[int, str] = {}
-    asked = [k for k, c in enumerate(closures) if k not in excluded and not (c.metric and c.covariance is not None)]
-    for k in sorted(asked, key=lambda k: -closures[k].match_ratio):
-        closure = closures[k]
-        low, high = sorted((closure.query, closure.match))
-        others = kept.setdefault((low, high), [])
-        if any(_agree(closures[other], closure) for other in others):
-            verb = "repeats"
-        elif others and closure.match_ratio < closures[others[0]].match_ratio:
-            verb = "contradicts"
-        else:
-            others.append(k)
+    for k, closure in enumerate(closures):
+        if k in excluded or (closure.metric and closure.covariance is not None):
             continue
-        reasons[k] = f"closure {closure.query} - {closure.match}: {verb} another closure of the same keyframes"
+        low, high = sorted((closure.query, closure.match))
+        other = best.setdefault((low, high), k)
+        if other == k:
+            continue
+        keep, drop = (k, other) if closure.match_ratio > closures[other].match_ratio else (other, k)
+        best[low, high] = keep
+        verb = "repeats" if _agree(closures[keep], closures[drop]) else "contradicts"
+        reasons[drop] = (
+            f"closure {closures[drop].query} - {closures[drop].match}: {verb} another closure of the same keyframes"
+        )
     return reasons
 
 

@@ -236,14 +236,6 @@ def test_of_duplicates_the_best_is_kept() -> None:
     assert "contradicts" in contradicts.reason
 
 
-def test_of_two_that_contradict_each_other_and_are_as_good_the_solver_decides() -> None:
-    right = closure(A, 1, B, 2)
-    wrong = replace(right, T_query_match_unscaled=pose(np.eye(3), np.array([0.0, 0.0, 1.0])))
-    solution = solved(PoseGraph(ODOMETRY, [*pair_closures(), wrong, right]), BackendConfig())
-    assert solution.closures[-1].state is ClosureState.USED
-    assert solution.closures[-2].state is not ClosureState.USED
-
-
 @pytest.mark.parametrize("broken", [np.full((5, 4, 4), np.nan), np.zeros((0, 4, 4)), np.zeros((5, 4, 4))])
 def test_a_robot_with_broken_odometry_is_left_out_by_name(broken: Float) -> None:
     solution = solved(
