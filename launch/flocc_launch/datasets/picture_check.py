@@ -228,10 +228,12 @@ def reordered(T: Float, places: int) -> Float:
 
 def posed_pairs(source: Source, trajectory: Trajectory) -> list[PosedPair] | None:
     """Pairs of pictures between which the camera turns, from all over the recording; None where nothing can be seen."""
+    chosen, lens = chosen_pairs(source.images, trajectory), source.lens
+    if lens is None or not chosen:
+        return None
     registrar_of = build_perception(PerceptionConfig())
-    registrar, lens = registrar_of.registrar, source.lens
-    chosen = chosen_pairs(source.images, trajectory)
-    if lens is None or not chosen or not isinstance(registrar, SeesFlow):
+    registrar = registrar_of.registrar
+    if not isinstance(registrar, SeesFlow):
         return None
     try:
         straightener = Straightener(lens.camera, lens.view_rad)
