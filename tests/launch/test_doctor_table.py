@@ -306,10 +306,14 @@ def test_every_row_can_be_brought_about(each: Row, tmp_path: Path, monkeypatch: 
 def test_every_page_that_advice_names_holds_what_it_is_named_for() -> None:
     sources = "".join(path.read_text(encoding="utf-8") for path in Path(doctor.__path__[0]).glob("*.py"))
     pages = set(re.findall(r"docs/[\w-]+\.md", sources))
-    assert pages == {"docs/back-end.md"}
-    text = (PAGE.parents[1] / "docs/back-end.md").read_text(encoding="utf-8").lower()
-    assert "warnings" in text
-    assert "scale" in text
+    promised = {
+        "docs/back-end.md": ("warnings", "scale"),
+        "docs/measurements.md": ("## the kinds", "quaternion w x y z"),
+    }
+    assert pages == set(promised)
+    for page, words in promised.items():
+        text = (PAGE.parents[1] / page).read_text(encoding="utf-8").lower()
+        assert [word for word in words if word not in text] == []
 
 
 @pytest.mark.parametrize(("refused", "used", "told"), [(7, 5, True), (6, 6, False), (3, 0, False), (4, 3, True)])
