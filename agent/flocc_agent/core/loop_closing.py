@@ -28,7 +28,7 @@ from flocc_agent.core.prospects import UNLIKELY, Agreement, Prospect, Prospects
 from flocc_agent.core.pulls import remember
 from flocc_agent.core.reports import CandidateFound
 from flocc_agent.core.spared import HeldClosures, NoClosures, Spared
-from flocc_agent.core.work import OdometryPairOf, WorkTable
+from flocc_agent.core.work import OdometryPairOf, Order, WorkTable
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidateOffer, CandidatePair
 
@@ -89,7 +89,7 @@ class LoopClosing:
         self._front_ends = FrontEnds()
         self._prospects = Prospects(agreement)
         self._unlikely: list[CandidatePair] = []
-        self._spared = Spared(held or NoClosures(), parameters.closures_enough)
+        self._spared = Spared(held or NoClosures(), parameters.closures_enough, parameters.sparing_logs_min)
         self._told: list[CandidatePair] = []
         self._chosen: list[CandidatePair] | None = None
         self._resolved = PairSet()
@@ -155,6 +155,7 @@ class LoopClosing:
             if self._prospects.was_refused_unseen(pair):
                 self._prospects.on_settled(pair)
                 self._resolved.discard(pair)
+            self._spared.remove(pair)
             if not self._knows(pair):
                 fact = CandidateFound(query=pair.low, match=pair.high, similarity=round(similarity, 4))
                 effects.append(Report(fact))
@@ -204,6 +205,8 @@ class LoopClosing:
         self._resolved.discard(pair)
         if not self._knows(pair) and self._concerns(pair):
             self._assign(Candidate(pair, 0.0), now)
+        for other, similarity in self._spared.on_gone(pair):
+            self._assign(Candidate(other, similarity), now)
 
     def on_resolved(self, pair: CandidatePair) -> None:
         """A record of this pair is in a log: nobody needs to register it."""
@@ -242,7 +245,7 @@ class LoopClosing:
             if self._owner(other) == self._own:
                 self._assign(Candidate(other, 0.0), now)
         self._spare_beside(pair)
-        for other, similarity in self._spared.on_closure(pair):
+        for other, similarity in self._spared.on_closure(pair, is_own):
             self._assign(Candidate(other, similarity), now)
 
     def on_rejection(self, pair: CandidatePair, reason: str, was_seen: bool = True) -> bool:
@@ -428,8 +431,8 @@ class LoopClosing:
         return known or pair in self._spared
 
     def _spares(self, candidate: Candidate) -> bool:
-        """Whether a pair tells nothing new; then nobody waits for it."""
-        if not self._spared.is_told(candidate.pair):
+        """Whether a pair tells nothing new; then nobody waits for it. One that is asked for is to tell it once more."""
+        if self._prospects.was_asked(candidate.pair) or not self._spared.is_told(candidate.pair):
             return False
         self._spared.add(candidate.pair, candidate.similarity)
         self._told.append(candidate.pair)
@@ -437,9 +440,11 @@ class LoopClosing:
 
     def _spare_beside(self, closure: CandidatePair) -> None:
         """Spare pairs beside a new closure that nobody began to register here."""
-        if not self._parameters.closures_enough:
-            return
-        for similarity, pair in self._work.beside(closure):
+        if self._spared.is_any():
+            self._spare_told(self._work.beside(closure))
+
+    def _spare_told(self, waiting: Iterable[Order]) -> None:
+        for similarity, pair in waiting:
             if self._spares(Candidate(pair, -similarity)):
                 self._work.remove(pair)
                 self._chosen, self._changed = None, True
@@ -510,6 +515,10 @@ class LoopClosing:
             work = self._work.start_next(now + REGISTRATION_TIMEOUT_S, self._choice())
             if work is None:
                 break
+            if self._spares(Candidate(work.pair, -work.order[0])):
+                self._work.remove(work.pair)
+                self._chosen = None
+                continue
             assert work.odometry is not None
             effects.append(Register(work.pair, work.query, work.match, *work.odometry))
         return effects
@@ -549,6 +558,8 @@ class LoopClosing:
     def _worth_fetching(self, now: float) -> Iterator[KeyframeId]:
         """The same without those of which no pair is likely; pairs that stay so are to be refused, a few at a time."""
         for keyframe in self._fetchable():
+            if self._spared.is_any():
+                self._spare_told(self._work.waiting(keyframe))
             prospects = {pair: self._prospects.of(pair, now) for pair in self._work.using(keyframe)}
             if keyframe.log == self._own or Prospect.LIKELY in prospects.values():
                 yield keyframe
