@@ -44,6 +44,7 @@ class Story:
     left_no_result: set[str] = field(default_factory=set)
     radio: dict[str, Any] = field(default_factory=dict)
     steps_m: dict[str, float] = field(default_factory=lambda: {"r1": 0.0, "r2": 0.0})
+    perception: dict[str, Any] = field(default_factory=dict)
 
     def say(self, t: float, robot: str, event: str, **fields: Any) -> "Story":
         self.events.append({"t": t, "robot": robot, "event": event, **fields})
@@ -55,7 +56,8 @@ class Story:
 
     def write(self, path: Path) -> RunFolder:
         folder = RunFolder.create(path)
-        folder.write_run(Run(scenario="broken", robots=["r1", "r2"], settings=SETTINGS, radio=self.radio))
+        about = {"settings": SETTINGS, "radio": self.radio, "perception": self.perception}
+        folder.write_run(Run(scenario="broken", robots=["r1", "r2"], **about))
         folder.write_events(self.events)
         for robot in {"r1", "r2"} - self.left_no_result:
             folder.write_result(self.result(robot))

@@ -36,7 +36,7 @@ PAGE = Path(__file__).parents[2] / "docs/doctor.md"
 HELD_CLOSURE = f"closure r1/3 - r2/5: {SECOND_PLACE}of 5 places where r1 and r2 would be side by side 3 do not match"
 KINDS = {"well": Severity.GOOD, "blocks": Severity.BLOCKS, "hinders": Severity.HINDERS, "note": Severity.NOTE}
 OF = {
-    "run": ("diagnose", "steps", "held_joins", "general", "cameras"),
+    "run": ("diagnose", "steps", "held_joins", "general", "cameras", "gravity"),
     "swarm": ("live", "live_steps", "held_joins", "cameras"),
     "machine": ("installation", "network_check"),
 }
@@ -129,6 +129,15 @@ def refusing(refused: int = 7, used: int = 5) -> Story:
     return merged().say(14.0, "r1", "optimised", term=1, round=3, components=[["r1", "r2"]], **counts)
 
 
+def upright(*up: float) -> Story:
+    """Two robots whose odometry frames differ by a quarter turn about z, and a direction that is called up."""
+    story = merged()
+    story.perception = {"odometry_up": list(up)}
+    turned = {"T_query_match_unscaled": [1.0, 0.0, 0.0, np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)], "scale_initial": 1.0}
+    story.closures = [ClosureKnown(query=f"r1/{k}", match=f"r2/{k}", scale=1.0, **turned) for k in range(2, 8)]
+    return story
+
+
 def warning(*texts: str) -> Story:
     parts = {"components": [["r1", "r2"]], "warnings": list(texts)}
     return merged().say(14.0, "r1", "optimised", term=1, round=3, **parts)
@@ -149,6 +158,8 @@ STORIES: dict[str, Callable[[], Story]] = {
     "mixed-frames": doubting("mixed frames", 1.0),
     "overlay": doubting("overlay", 0.3, "bottom"),
     "frozen-pictures": doubting("frozen", 10),
+    "stands-still": doubting("standing", 10),
+    "odometry-up": lambda: upright(0.0, -1.0, 0.0),
     "camera": doubting("of a later version", 2.0),
     "merged": merged,
     "places-alike": looking_alike,
@@ -211,6 +222,7 @@ SWARMS = {
     "mixed-frames": [row("r1", "r2", camera=[doubt("mixed frames", 1.0)]), row("r2", "r1")],
     "overlay": [row("r1", "r2", camera=[doubt("overlay", 0.3)]), row("r2", "r1")],
     "frozen-pictures": [row("r1", "r2", camera=[doubt("frozen", 10)]), row("r2", "r1")],
+    "stands-still": [row("r1", "r2", camera=[doubt("standing", 10)]), row("r2", "r1")],
     "camera": [row("r1", "r2", camera=[doubt("out of focus", 1.0)]), row("r2", "r1")],
     "not-merged-yet": apart(pairs=[pair(accepted=3)]),
 }
@@ -382,6 +394,13 @@ def test_a_map_that_puts_robots_side_by_side_whose_pictures_never_match_is_doubt
 )
 def test_robots_that_met_elsewhere_or_agree_are_believed(story: Story, tmp_path: Path) -> None:
     assert diagnose(story.write(tmp_path / "run"))[0].cause == "merged"
+
+
+def test_a_direction_that_is_not_up_is_named_with_the_one_that_closures_leave_where_it_is(tmp_path: Path) -> None:
+    (found,) = [f for f in diagnose(upright(0.0, -1.0, 0.0).write(tmp_path / "y")) if f.cause == "odometry-up"]
+    assert "agreed with 0 of 6 used closures" in found.sentence
+    assert "With [0, 0, 1], or its opposite, 6 agree" in found.advice
+    assert not [f for f in diagnose(upright(0.0, 0.0, 2.0).write(tmp_path / "z")) if f.cause == "odometry-up"]
 
 
 def test_robots_that_died_are_not_counted_among_all(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from flocc_launch.report.text import sentences
 from flocc_launch.report.verdict import verdict
 from flocc_launch.runs.plain_numbers import plain
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError, event_from_line
-from flocc_launch.runs.timeline import deaths_unasked, merged_after_s
+from flocc_launch.runs.timeline import Merges, deaths_unasked, merges_of
 from flocc_launch.runs.trajectory_errors import ate_m
 
 ROBOTS = ["r1", "r2", "r3"]
@@ -143,10 +143,37 @@ def test_living_robots_count_as_merged_when_another_died() -> None:
         '{"t": 3, "robot": "r3", "event": "agent_died", "signal": 9}',
     ]
     events = [event_from_line(line, "events.jsonl") for line in lines]
-    assert merged_after_s(events, ["r1", "r2", "r3"]) == 3
-    assert merged_after_s(events, ["r1", "r2"]) == 2
-    assert merged_after_s(events[:2], ["r1", "r2", "r3"]) is None
-    assert merged_after_s(events[:1], ["r1"]) is None
+    assert merges_of(events, ["r1", "r2", "r3"]) == Merges(3)
+    assert merges_of(events, ["r1", "r2"]) == Merges(2)
+    assert merges_of(events[:2], ["r1", "r2", "r3"]) == Merges(None)
+    assert merges_of(events[:1], ["r1"]) == Merges(None)
+
+
+A, B, C = "map/r1", "map/r2", "map/r1.1"
+
+
+@pytest.mark.parametrize(
+    ("story", "found"),
+    [
+        ([(1, "r1", A), (2, "r2", A)], Merges(2)),
+        ([(1, "r1", A), (2, "r2", A), (3, "r2", B), (5, "r2", A)], Merges(5, ((2, 3),))),
+        ([(1, "r1", A), (2, "r2", A), (3, "r2", B)], Merges(None, ((2, 3),))),
+        ([(1, "r1", B), (2, "r2", B), (3, "r1", A), (4, "r2", A)], Merges(2)),
+        ([(1, "r1", B), (2, "r2", B), (3, "r1", C), (4, "r1", A), (5, "r2", A)], Merges(5, ((2, 3),))),
+        ([(1, "r1", A), (2, "r2", A), (3, "r2", "died"), (4, "r2", "keyframe"), (5, "r2", B), (6, "r2", A)], Merges(2)),
+        ([(1, "r1", A), (2, "r2", A), (3, "r2", "died")], Merges(2)),
+        ([(1, "r1", A), (2, "r2", A), (3, "r2", B), (4, "r1", "died")], Merges(None, ((2, 3),))),
+    ],
+    ids=["held", "taken back", "parted at the end", "gone over", "apart meanwhile", "came back", "died", "lost"],
+)
+def test_a_merge_counts_from_when_it_held(story: list[tuple[float, str, str]], found: Merges) -> None:
+    kinds = {
+        "died": '"event": "agent_died", "signal": 9',
+        "keyframe": '"event": "keyframe", "keyframe": "r2/9", "stamp_s": 1, "T_odom_body": [0, 0, 0, 1, 0, 0, 0]',
+    }
+    correction = '"event": "correction", "term": 1, "round": 1, "T_map_odom": [0, 0, 0, 1, 0, 0, 0], "map_frame": "%s"'
+    lines = [f'{{"t": {t}, "robot": "{robot}", {kinds.get(what) or correction % what}}}' for t, robot, what in story]
+    assert merges_of([event_from_line(line, "events.jsonl") for line in lines], ["r1", "r2"]) == found
 
 
 def test_bytes_of_a_restarted_robot_are_added(folder: RunFolder) -> None:

@@ -11,8 +11,8 @@ from tests.launch.synthetic_run import Synthetic
 from typer.testing import CliRunner
 
 from flocc_agent.config import ConfigError, Mast3rConfig, PerceptionConfig, TransportConfig
-from flocc_agent.core.reports import CameraDoubted
-from flocc_agent.runtime.event_lines import Reported, line_of
+from flocc_agent.core.reports import CameraDoubted, ClosureAccepted
+from flocc_agent.runtime.event_lines import Reported, line_of, of_kind
 from flocc_launch.commands.tools import add_tools
 from flocc_launch.dashboard.status_table import (
     RobotStatus,
@@ -25,6 +25,7 @@ from flocc_launch.dashboard.status_table import (
 )
 from flocc_launch.doctor import Finding, Severity, finding_lines, installation, network_check
 from flocc_launch.doctor.live import diagnose_live
+from flocc_launch.runs.run_folder import RunFolder
 
 
 def row(robot: str, neighbours: str = "", **fields: object) -> RobotStatus:
@@ -61,6 +62,9 @@ def test_the_status_of_a_run_folder_is_that_of_its_robots(tmp_path: Path) -> Non
         ("r3", "stopped", "map/r1"),
     ]
     assert rows[1].keyframes == 60
+    made = [event.robot for event in of_kind(RunFolder.open(tmp_path / "run").events(), ClosureAccepted)]
+    assert [row.accepted for row in rows] == [made.count(row.robot) for row in rows]
+    assert [(row.closures, row.candidates) for row in rows] == [(None, None)] * 3, "events tell what each one did"
     assert [entry["robot"] for entry in json.loads(status_json(rows))] == ["r1", "r2", "r3"]
 
 

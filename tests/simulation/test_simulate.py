@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from flocc_agent.core.reports import ClosureAccepted, CorrectionApplied, KeyframeTaken, LeaderFollowed
+from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.event_lines import of_kind
 from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.doctor import diagnose
@@ -17,6 +18,7 @@ from flocc_launch.report.text import sentences
 from flocc_launch.runs.loaded_run import load
 from flocc_launch.runs.moments import errors_then_m, moments_of
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError
+from flocc_launch.runs.tracks import lost_robots
 from flocc_launch.scenarios.leader_faults import FaultError
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import simulate
@@ -134,6 +136,12 @@ def test_after_a_scripted_kill_the_error_is_of_the_survivors_and_of_the_dead_unt
     assert result is not None
     taken = of_kind(RunFolder.open(tmp_path / "run").events(), KeyframeTaken)
     assert len(result.keyframes) == sum(event.robot == "r2" and event.t <= 25.0 for event in taken)
+    assert result.T_map_odom is not None
+    survivors = RunFolder.open(tmp_path / "run").results()
+    lost = lost_robots(survivors)["r2"]
+    assert (lost.map_frame, survivors["r3"].lost[0].knots) == ("map/r1", [])
+    off = lost.T_map_body(result.T_odom_body()) - [pose_from_tq(np.array(k.T_map_body)) for k in result.keyframes]
+    assert np.abs(off[:, :3, 3]).max() < 0.5
 
 
 def test_a_fault_may_name_whoever_leads_when_it_happens(tmp_path: Path) -> None:

@@ -127,14 +127,14 @@ def held_closures(
 ) -> dict[int, str]:
     """Reasons why closures are held, by number; none where measurements are to be taken as they are given.
 
-    Only closures from images are: others (support is not 1) are fixes, tags, or of an opened map.
+    Only closures from images are: others are fixes, tags, or of an opened map.
     """
     if config.formulation is Formulation.BASE or config.solver not in (Solver.GNC_TLS, Solver.GNC_GM):
         return {}
     doubted = {k: f"closure {c.query} - {c.match}: {c.doubt}" for k, c in closures.items() if c.doubt}
     closures = {k: c for k, c in closures.items() if k not in doubted}
     ways = {log: Way.of(trajectory, config) for log, trajectory in trajectories.items()}
-    of_pairs = measured_by_pair(ways, {k: c for k, c in closures.items() if c.support == 1}, config)
+    of_pairs = measured_by_pair(ways, {k: c for k, c in closures.items() if c.from_images}, config)
     bound, bound_of_one = (float(chdtri(freedom, 1.0 - config.inlier_probability)) for freedom in (6.0, 1.0))
     judges = [judges_of(pair, ways, of_pairs, bound) for pair in of_pairs]
     excess, of_all = excess_of(judges), excess_with_all(judges)

@@ -3,11 +3,14 @@
 A single closure between two maps contradicts nothing, so no robust solver can tell that it is wrong; it alone must not
 join them. Maps are joined where, however they are divided into two sides, at least `closures_to_join_min` closures that
 agree with each other connect the sides: several between two robots, or one on each side of a ring of robots.
+
+A single sighting of a tag or of a robot, or a single pose in the world, contradicts nothing either. A landmark is no
+map: it goes with who saw it most often, whatever that is, and joins whoever else saw it often enough.
 """
 
 from collections.abc import Mapping, Sequence
 
-from flocc_agent.core.pose_graph import LoopClosure, components_of
+from flocc_agent.core.pose_graph import LoopClosure, components_of, is_landmark
 from flocc_protocol.ids import LogId
 
 Pair = tuple[LogId, LogId]
@@ -24,7 +27,7 @@ def too_few(logs: Sequence[LogId], closures: Mapping[int, LoopClosure], closures
 
 def _weak(logs: Sequence[LogId], closures: Mapping[int, LoopClosure], closures_min: int) -> set[int]:
     """Closures across a division with too few of them, in each connected part; none where there is no such division."""
-    group = {log: log for log in logs}
+    group = {log: log for log in logs} | _observers(closures)
     while (pair := _joined(_between(group, closures), closures_min)) is not None:
         low, high = pair
         group = {log: low if found == high else found for log, found in group.items()}
@@ -42,6 +45,17 @@ def _weak(logs: Sequence[LogId], closures: Mapping[int, LoopClosure], closures_m
         if side and support < closures_min:
             cut |= {k for (a, b), ids in between.items() if (a in side) != (b in side) for k in ids}
     return cut
+
+
+def _observers(closures: Mapping[int, LoopClosure]) -> dict[LogId, LogId]:
+    """Of each landmark the log that saw it most often, the lowest of those."""
+    seen: dict[LogId, dict[LogId, int]] = {}
+    for closure in closures.values():
+        for end, by in ((closure.match.log, closure.query.log), (closure.query.log, closure.match.log)):
+            if is_landmark(end):
+                times = seen.setdefault(end, {})
+                times[by] = times.get(by, 0) + closure.support
+    return {end: min(times, key=lambda by: (-times[by], by)) for end, times in seen.items()}
 
 
 def _least_division(groups: Sequence[LogId], supports: Supports) -> tuple[frozenset[LogId], int]:

@@ -19,10 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.alignment import evenly
+from flocc_agent.backend.misread import misread
 from flocc_agent.backend.problem import diagonal_covariance
 from flocc_agent.backend.screening import first_not_rigid, is_covariance
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.geodesy import Place, T_enu_enu
+from flocc_agent.core.measurements import PoseFix
 from flocc_agent.core.pose_graph import (
     EARTH,
     LANDMARK,
@@ -47,7 +49,7 @@ Int = NDArray[np.int64]
 CERTAIN_RATIO = 1e6
 """Match ratio of what was measured: Eq. (2) gives it the probability 1."""
 JOINS = 1000
-"""Support of what fixes all six degrees of freedom: one joins maps."""
+"""Support of what nothing else needs to agree with to join maps: several positions together, and a known start."""
 ROTATION_OPEN_SIGMA_RAD = 10.0
 POSITIONS_MIN = 3
 SPREAD_SIGMAS = 3.0
@@ -120,6 +122,7 @@ def without_factors(solution: GraphSolution, graph: PoseGraph, expanded: Expande
     for k, reason in expanded.left_out.items():
         results[k] = FactorResult(graph.measured[k], ClosureState.EXCLUDED, 0.0, 0.0, reason)
     measured = tuple(results[k] for k in range(len(graph.measured)))
+    of_many = misread(measured, solution.components)
     return replace(
         solution,
         components=tuple(
@@ -131,7 +134,12 @@ def without_factors(solution: GraphSolution, graph: PoseGraph, expanded: Expande
         warnings=(
             *(warning for warning in solution.warnings if LANDMARK not in warning),
             *expanded.notes,
-            *(f"{r.factor} is not used: {r.reason}" for r in measured if r.reason and r.reason not in expanded.notes),
+            *dict.fromkeys(of_many.values()),
+            *(
+                f"{r.factor} is not used: {r.reason}"
+                for k, r in enumerate(measured)
+                if r.reason and k not in of_many and r.reason not in expanded.notes
+            ),
         ),
         measured=measured,
     )
@@ -178,13 +186,14 @@ def _from_origin(factor: MeasuredFactor, origin: Place | None) -> MeasuredFactor
 
 
 def _whole(factor: MeasuredFactor) -> LoopClosure:
-    return _closure(factor, factor.T_query_match, factor.covariance)
+    """A whole pose: a sighting may be wrong as a registration may; a start is known, and there is but one."""
+    is_start = factor.kind == PoseFix.kind and factor.at.index == 0
+    return _closure(factor, factor.T_query_match, factor.covariance, JOINS if is_start else 1)
 
 
-def _closure(factor: MeasuredFactor, T: Float, covariance: Float, support: int = JOINS) -> LoopClosure:
-    return LoopClosure(
-        factor.query, factor.match, T, CERTAIN_RATIO, covariance=covariance, metric=True, support=support
-    )
+def _closure(factor: MeasuredFactor, T: Float, covariance: Float, support: int) -> LoopClosure:
+    ends = factor.query, factor.match
+    return LoopClosure(*ends, T, CERTAIN_RATIO, covariance=covariance, metric=True, support=support, from_images=False)
 
 
 # Positions without a rotation

@@ -90,7 +90,7 @@ def _is_small(graph: PoseGraph, config: BackendConfig, last: GraphSolution) -> b
         config.formulation is Formulation.INDEPENDENT
         and config.solver in (Solver.GNC_TLS, Solver.GNC_GM)
         and not config.pairwise_consistency
-        and all(closure.support == 1 for closure in graph.closures)
+        and all(closure.from_images for closure in graph.closures)
         and not any(isinstance(log, SavedLog) for log in graph.trajectories)
     )
     lengths = {log: len(T) for component in last.components for log, T in component.T_map_keyframe.items()}

@@ -6,7 +6,7 @@ numbers, and become matrices when somebody wants them.
 
 from array import array
 from bisect import bisect_right, insort
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from struct import Struct
@@ -286,14 +286,9 @@ class GraphAssembly:
         measured = self._measured.factors(self._odometry, self._known)
         unread = {KeyframeId(log, index) for log, odometry in self._odometry.items() for index in odometry.unread}
         closures = self._closures.closures(lambda log: len(trajectories.get(log, ())), unread)
-        return PoseGraph(trajectories, tuple(map(self._doubted, closures)), measured=measured, saved=self._saved)
-
-    def _doubted(self, closure: LoopClosure) -> LoopClosure:
-        """A closure, with why it is doubted where it is."""
-        low, high = sorted((closure.query, closure.match))
-        doubted = self._tentative.of(low.log, high.log).doubted
-        why = doubted.get(CandidatePair(low, high)) if doubted else None
-        return closure if why is None else replace(closure, doubt=why)
+        if doubted := self._tentative.doubted():
+            closures = [_doubted(closure, doubted) for closure in closures]
+        return PoseGraph(trajectories, tuple(closures), measured=measured, saved=self._saved)
 
     def asked(self, pair: CandidatePair) -> tuple[CandidatePair, ...]:
         """Pairs that would tell whether the tentative joins of a pair's two logs are right."""
@@ -359,3 +354,9 @@ class GraphAssembly:
         for keyframe in keyframes:
             if not self._known(keyframe):
                 self._early[keyframe] = self._early.get(keyframe, 0) + 1
+
+
+def _doubted(closure: LoopClosure, doubted: Mapping[CandidatePair, str]) -> LoopClosure:
+    """A closure, with why it is doubted where it is."""
+    why = doubted.get(CandidatePair.of(closure.query, closure.match))
+    return closure if why is None else replace(closure, doubt=why)

@@ -50,13 +50,21 @@ class Track:
 
 def corrected(correction: LogCorrection, T_odom_camera: Float, numbers: NDArray[np.integer]) -> Float:
     """Corrected poses (N, 4, 4) of keyframes (N, 4, 4) with these numbers (N,)."""
-    T_map_odom = pose_from_tq(np.array(correction.T_map_odom))
-    twists = None if correction.knots is None or not len(numbers) else correction.knots.twists.numpy()
-    if correction.knots is None or twists is None or not twists.any():
+    T_map_odom, knots = pose_from_tq(np.array(correction.T_map_odom)), correction.knots
+    if knots is None or not len(numbers):
         return np.asarray(T_map_odom @ T_odom_camera)
-    about_m = correction.knots.about_odom_m.numpy()
-    twists = _between(correction.knots.keyframes.numpy(), twists, numbers)
-    return np.asarray(T_map_odom @ _moved(about_m) @ poses_of_twists(twists) @ _moved(-about_m) @ T_odom_camera)
+    twists, about_m = knots.twists.numpy(), knots.about_odom_m.numpy()
+    return np.asarray(T_map_odom @ bent(knots.keyframes.numpy(), twists, about_m, numbers) @ T_odom_camera)
+
+
+def bent(
+    keyframes: Float | NDArray[np.integer], twists: Float, about_odom_m: Float, numbers: NDArray[np.integer]
+) -> Float:
+    """What knots at keyframes do to poses of a log in its odom frame: (N, 4, 4), or (4, 4) where it is nothing."""
+    if not twists.any():
+        return np.eye(4)
+    twists = _between(keyframes, twists, numbers)
+    return np.asarray(_moved(about_odom_m) @ poses_of_twists(twists) @ _moved(-about_odom_m))
 
 
 def strays(correction: LogCorrection, track: Track) -> float:

@@ -91,9 +91,10 @@ class CameraDoubted:
 
     Attributes:
         doubt: "focal length", "mounting", "focal length and mounting", "mirrored", "inverted poses", "mixed frames",
-            "overlay" (what moves with the camera) or "frozen" (pictures that were taken before).
+            "overlay" (what moves with the camera), "frozen" (pictures that were taken before) or "standing" (pictures
+            that show what one before did, though odometry goes on).
         amount: True focal length over the configured one; degrees of a mounting; share of an overlay in the picture;
-            number of frozen pictures; 1 elsewhere.
+            number of pictures that are frozen, or stand; 1 elsewhere.
         where: An overlay's place in the picture, or the turn about the camera's axes; else empty.
         pairs: Of consecutive keyframes that say so.
         withheld: Whether the robot offers no keyframe for closures as long as its pictures say so.

@@ -150,6 +150,12 @@ def is_firm(between: Between, agree: Bool) -> bool:
     return bool(np.any(places & (agree.sum(axis=1) >= FIRM_MIN)))
 
 
+def may_contradict(ends: Int) -> bool:
+    """Whether any of closures with such ends (K, 2) could see the place of another at one end and not at the other."""
+    near = np.abs(ends[:, None] - ends[None]) <= STRETCH
+    return bool(np.any(near[..., 0] != near[..., 1]))
+
+
 def contradicting(between: Between, join: Join) -> list[tuple[int, int, int]]:
     """Closures that see the place of a join at one end and, by odometry, another place at the other end.
 

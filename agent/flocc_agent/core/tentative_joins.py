@@ -5,7 +5,7 @@ somebody asks: who leads, or one of the two for the pairs that it is to ask for.
 agree nothing is looked at any more.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -17,6 +17,7 @@ from flocc_agent.core.known_sets import PairSet, pair_number
 from flocc_agent.core.second_places import (
     ACCIDENT_RATIO,
     CLOSURES_MAX,
+    REFUSED_MIN,
     Between,
     Join,
     Stretch,
@@ -25,6 +26,7 @@ from flocc_agent.core.second_places import (
     contradicting,
     is_firm,
     joins_of,
+    may_contradict,
     stretch_of,
 )
 from flocc_agent.core.spared import STRETCH
@@ -84,6 +86,8 @@ class TentativeJoins:
         self._track = track
         self._refused = PairSet()
         self._found: dict[Logs, Tentative] = {}
+        self._undoubted: set[Logs] = set()
+        """For now, without a look at odometry."""
         self._joined: set[Logs] = set()
         self._firm: set[Logs] = set()
         self._open: dict[Logs, frozenset[CandidatePair]] = {}
@@ -94,7 +98,7 @@ class TentativeJoins:
         logs = pair.low.log, pair.high.log
         if pair.low.log != pair.high.log and logs not in self._firm:
             self._joined.add(logs)
-            self._found.pop(logs, None)
+            self._forget(logs)
 
     def on_refused(self, pair: CandidatePair) -> None:
         """A pair was registered in vain."""
@@ -103,7 +107,7 @@ class TentativeJoins:
             return
         self._refused.add(pair)
         if self.is_tentative(*logs):
-            found = self._found.pop(logs, None)
+            found = self._forget(logs)
             self._open.setdefault(logs, frozenset() if found is None else frozenset(found.doubted))
 
     def on_withdrawn(self, log: LogId, first: int, end: int, counts: Callable[[CandidatePair], bool]) -> None:
@@ -111,6 +115,12 @@ class TentativeJoins:
         self._refused.keep_of_stretch(log, first, end, counts)
         self._found = {logs: found for logs, found in self._found.items() if log not in logs}
         self._firm = {logs for logs in self._firm if log not in logs}
+        self._undoubted = {logs for logs in self._undoubted if log not in logs}
+
+    def _forget(self, logs: Logs) -> Tentative | None:
+        """What was known of two logs, which is so no more."""
+        self._undoubted.discard(logs)
+        return self._found.pop(logs, None)
 
     def is_tentative(self, low: LogId, high: LogId) -> bool:
         """Whether two logs are joined, and as far as is known not by closures of more than one place."""
@@ -119,8 +129,28 @@ class TentativeJoins:
     def changes(self) -> int:
         """How often refusals changed what is doubted; looked at by who solves, and only then."""
         before, self._open = self._open, {}
-        self._changes += sum(self.of(*logs).doubted.keys() != doubted for logs, doubted in before.items())
+        self._changes += sum(self._doubted(logs).keys() != doubted for logs, doubted in before.items())
         return self._changes
+
+    def doubted(self) -> dict[CandidatePair, str]:
+        """All closures that are held, and why."""
+        tentative = self._joined - self._firm
+        return {pair: why for logs in sorted(tentative) for pair, why in self._doubted(logs).items()}
+
+    def _doubted(self, logs: Logs) -> Mapping[CandidatePair, str]:
+        """Those of two logs; odometry is looked at only where numbers of keyframes and what was refused allow any."""
+        if logs in self._undoubted:
+            return {}
+        if logs not in self._found and not self._may_doubt(logs):
+            self._undoubted.add(logs)
+            return {}
+        return self.of(*logs).doubted
+
+    def _may_doubt(self, logs: Logs) -> bool:
+        every = self._closures.of_logs(*logs)
+        if len(every) > CLOSURES_MAX or len(self._refused.of_logs(*logs)) >= REFUSED_MIN:
+            return True
+        return len(every) >= 2 and may_contradict(np.array([[pair.low.index, pair.high.index] for pair in every]))
 
     def of(self, low: LogId, high: LogId) -> Tentative:
         """What is known of the joins of two logs."""

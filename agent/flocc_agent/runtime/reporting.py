@@ -16,9 +16,9 @@ from flocc_agent.core.reports import ClosureAccepted, CorrectionApplied, Fact, K
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import inverse, pose7, pose7s, pose_from_tq, poses_from_tq
 from flocc_agent.runtime.event_lines import Reported
-from flocc_agent.runtime.robot_result import ClosureKnown, KeyframeResult, RobotResult
+from flocc_agent.runtime.robot_result import ClosureKnown, KeyframeResult, LostRobot, RobotResult
 from flocc_protocol.codec import Pose7
-from flocc_protocol.messages import CandidatePair
+from flocc_protocol.messages import CandidatePair, Knots
 from flocc_protocol.records import ClosureRecord, KeyframeRecord, RejectionRecord
 
 Float = NDArray[np.float64]
@@ -94,8 +94,36 @@ def result_of(robot: Robot, T_body_camera: Float, solution: GraphSolution | None
         keyframes=keyframes,
         closures=closures_known(robot, solution),
         logs={str(digest.log): digest.count for digest in robot.gossip.digests()},
+        lost=lost_robots(robot),
         best_similarities=best_similarities(robot),
     )
+
+
+def lost_robots(robot: Robot) -> list[LostRobot]:
+    """The last corrections of robots that are not heard, as far as a robot knows them; all of them if it leads."""
+    heard = {robot.log.robot, *robot.neighbours.names()}
+    found = []
+    for log in sorted(robot.gossip.logs):
+        known = None if log.robot in heard else robot.corrections.of(log)
+        if known is None:
+            continue
+        where = LostRobot(
+            log=str(log),
+            map_frame=map_frame(known.anchor),
+            term=known.term.counter,
+            round=known.round,
+            T_map_odom=list(known.T_map_odom),
+        )
+        found.append(where if known.knots is None else where.model_copy(update=_bends(known.knots)))
+    return found
+
+
+def _bends(knots: Knots) -> dict[str, object]:
+    return {
+        "knots": knots.keyframes.numpy().astype(int).tolist(),
+        "twists": knots.twists.numpy().round(6).tolist(),
+        "about_odom_m": knots.about_odom_m.numpy().tolist(),
+    }
 
 
 def corrected_bodies(robot: Robot, T_body_camera: Float) -> tuple[list[float], Float]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from flocc_agent.core.knots import bent
 from flocc_agent.geometry import pose_from_tq
 from flocc_protocol.ids import NAME_PATTERN, KeyframeId
 
@@ -78,6 +79,30 @@ class ClosureKnown(Record):
     """Metres per network unit after optimisation; null where the back end estimated none."""
 
 
+class LostRobot(Record):
+    """Where a map has a robot that a survivor no longer heard: its last correction, which it may never have got."""
+
+    log: str
+    map_frame: str
+    term: int
+    round: int
+    T_map_odom: Pose7
+    knots: list[int] = []
+    """Keyframes at which odometry was bent; none where the survivor only knows where the robot was last."""
+    twists: list[Annotated[list[float], Field(min_length=6, max_length=6)]] = []
+    """Of each knot: rotation (rad) and translation (m) about `about_odom_m`."""
+    about_odom_m: Annotated[list[float], Field(min_length=3, max_length=3)] = [0.0, 0.0, 0.0]
+
+    def T_map_body(self, T_odom_body: Float) -> Float:
+        """Odometry of all keyframes (N, 4, 4) as the map has it."""
+        T_map_odom = pose_from_tq(np.array(self.T_map_odom))
+        if not self.knots or len(self.knots) != len(self.twists):
+            return np.asarray(T_map_odom @ T_odom_body)
+        numbers = np.arange(len(T_odom_body))
+        bends = bent(np.array(self.knots), np.array(self.twists), np.array(self.about_odom_m), numbers)
+        return np.asarray(T_map_odom @ bends @ T_odom_body)
+
+
 class RobotResult(Record):
     """`robots/ROBOT/result.json`: what a robot knew at its end, or what its store held."""
 
@@ -92,6 +117,8 @@ class RobotResult(Record):
     closures: list[ClosureKnown] = []
     logs: dict[str, int] = {}
     """Log -> number of its records that this robot holds."""
+    lost: list[LostRobot] = []
+    """Robots that it no longer heard at the end, by log."""
     best_similarities: dict[str, float] = {}
     """Robot -> best cosine similarity of any of its keyframes with one of this robot, below the threshold as well."""
 

@@ -10,7 +10,18 @@ from flocc_launch.swarm.launching import Watch
 from flocc_launch.swarm.processes import AgentProcess
 
 NOTES_MAX = 6
-COLUMNS = ("robot", "state", "leader", "term", "neighbours", "keyframes", "closures", "queue", "map frame", "sent kB")
+COLUMNS = (
+    "robot",
+    "state",
+    "leader",
+    "term",
+    "neighbours",
+    "keyframes",
+    "closures",
+    "candidates",
+    "map frame",
+    "sent kB",
+)
 
 
 class LiveTable:

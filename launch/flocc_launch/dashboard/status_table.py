@@ -24,7 +24,7 @@ from flocc_protocol.errors import FloccError
 if TYPE_CHECKING:
     from flocc_agent.runtime.zenoh_admin import Survey
 
-OPTIONAL = frozenset({"waiting", "lost %", "refused", "camera"})
+OPTIONAL = frozenset({"closures", "candidates", "found", "accepted", "waiting", "lost %", "refused", "camera"})
 NO_ANSWER = "no answer"
 LEFT = frozenset({"robot", "state", "leader", "map frame", "hears", "camera"})
 
@@ -34,7 +34,14 @@ class StatusError(FloccError):
 
 
 class RobotStatus(MergeStatus):
-    """What one robot says of itself, or its events tell; what is not known is null."""
+    """What one robot says of itself, or its events tell; what is not known is null.
+
+    Attributes:
+        closures: Loop closures in all logs that it holds, as it says while it runs.
+        candidates: Pairs that it is to register and can, at that moment.
+        found: Candidates that it found since its start, as its events tell.
+        accepted: Closures among the pairs that it registered itself, as its events tell.
+    """
 
     robot: str
     state: str = "running"
@@ -45,6 +52,8 @@ class RobotStatus(MergeStatus):
     keyframes: int | None = None
     closures: int | None = None
     candidates: int | None = None
+    found: int | None = None
+    accepted: int | None = None
     sent_bytes: int | None = None
     received_bytes: int | None = None
     refused: dict[str, int] = Field(default_factory=dict)
@@ -139,8 +148,8 @@ def status_of_robot(robot: RobotView) -> RobotStatus:
         neighbours=tuple(robot.neighbours),
         map_frame=robot.map_frame,
         keyframes=robot.keyframes,
-        closures=robot.accepted,
-        candidates=robot.candidates,
+        found=robot.candidates,
+        accepted=robot.accepted,
         sent_bytes=robot.sent_bytes,
         received_bytes=robot.received_bytes,
         loss={peer: link.loss_ratio for peer, link in robot.links.items() if link.loss_ratio is not None},
@@ -178,6 +187,8 @@ def cells_of(row: RobotStatus) -> dict[str, str]:
         "keyframes": shown(row.keyframes),
         "closures": shown(row.closures),
         "candidates": shown(row.candidates),
+        "found": shown(row.found),
+        "accepted": shown(row.accepted),
         "waiting": shown(sum(row.queues.values()) if row.queues else None),
         "lost %": f"{100 * max(row.loss.values()):.0f}" if row.loss else "-",
         "sent kB": kilobytes(row.sent_bytes),
@@ -199,6 +210,7 @@ AMOUNTS = {
     "mounting": " {0:.0f}\N{DEGREE SIGN}",
     "overlay": " {1:.0f} %",
     "frozen": " {0:.0f}",
+    "standing": " {0:.0f}",
 }
 
 

@@ -42,7 +42,7 @@ def sentence_of(event: Reported[Fact]) -> str | None:
         case CorrectionApplied():
             return f"moved into {fact.map_frame}" if fact.frame_changed else None
         case RoundSolved():
-            return f"round {fact.round}: {fact.keyframes} keyframes, {fact.closures_used} closures"
+            return f"round {fact.round}: {fact.keyframes} keyframes, {fact.closures_used} closures used"
         case RoundFailed():
             return f"optimisation of round {fact.round} failed: {fact.reason}"
         case AgentDied():

@@ -18,6 +18,7 @@ CAUSES = {
     "mixed frames": "mixed-frames",
     "overlay": "overlay",
     "frozen": "frozen-pictures",
+    "standing": "stands-still",
 }
 OTHER_CAUSE = "camera"
 """Of a doubt that this version does not know."""

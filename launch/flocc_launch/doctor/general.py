@@ -19,6 +19,7 @@ from flocc_agent.runtime.event_lines import Reported, of_kind
 from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.doctor.cameras import doubted_cameras
 from flocc_launch.doctor.finding import APART_ADVICE, Finding, Severity
+from flocc_launch.doctor.gravity import odd_up
 from flocc_launch.runs.alike_places import ADVICE
 from flocc_launch.runs.closure_table import Pair
 from flocc_launch.runs.ground_truth import frame_sentences, other_clocks
@@ -53,6 +54,8 @@ SOLVER_ADVICE = {
     "measures lengths": "Calibrate what it takes lengths from: wheel radius, stereo baseline, camera height.",
     SECOND_PLACE: ADVICE,
     "held until another one agrees": "If it is right, pass the place again; if not, nothing is to be done.",
+    "sightings that agree": "One alone may be wrong: see it a second time, or set backend.closures_to_join_min = 1.",
+    "agree with the rest of the map": "docs/measurements.md says how each kind is written.",
     "look the same": "Look at the pictures of both places in the report; a fix, a tag or a known start decides.",
     "the distance between robots": "Let them meet side by side as well as ahead, or measure a length: fix, tag, range.",
 }
@@ -254,4 +257,5 @@ GENERAL: tuple[Callable[[LoadedRun], list[Finding]], ...] = (
     encoding_failures,
     unsteady_leaders,
     odd_truths,
+    odd_up,
 )

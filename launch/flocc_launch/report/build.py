@@ -22,6 +22,7 @@ from flocc_launch.report.model import (
     RobotBytes,
     RobotReport,
     RunReport,
+    Span,
     TrackError,
 )
 from flocc_launch.runs.alike_places import alike_places
@@ -36,7 +37,7 @@ from flocc_launch.runs.timeline import (
     ends,
     how_it_died,
     leader_changes,
-    merged_after_s,
+    merges_of,
     terms_led,
 )
 from flocc_launch.runs.tracks import RobotTrack
@@ -62,6 +63,7 @@ def build(loaded: LoadedRun) -> RunReport:
     apart = in_separate_frames(tracks)
     living = survivors(tracks, [robot.robot for robot in robots if robot.end == "died"])
     frames = frames_of(living)
+    merges = merges_of(loaded.events, [robot for robot in loaded.robots if robot not in run.servers])
     report = RunReport(
         flocc_version=flocc_version(),
         scenario=run.scenario,
@@ -73,7 +75,8 @@ def build(loaded: LoadedRun) -> RunReport:
         robots=list(loaded.robots),
         odometry_made=_odometry_made({robot: at for robot, at in run.recordings.items() if robot not in loaded.barred}),
         map_frames=frames,
-        merged_after_s=merged_after_s(loaded.events, [robot for robot in loaded.robots if robot not in run.servers]),
+        merged_after_s=merges.after_s,
+        merges_taken_back=[Span(from_s=from_s, to_s=to_s) for from_s, to_s in merges.taken_back],
         closures=closures_part(loaded),
         ate_joint_m=ate_joint_m(living),
         ate_dead_m=ate_dead_m(living, tracks),

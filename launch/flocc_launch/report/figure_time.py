@@ -230,8 +230,9 @@ def time_grid(axis: Axis, top: float, bottom: float) -> str:
 
 
 def moments(loaded: LoadedRun, report: RunReport) -> list[tuple[float, str, str]]:
-    """Time, name and class of the moments that are marked: the merge and deaths; in order of time."""
+    """Time, name and class of the moments that are marked, in order of time: merges, those taken back, deaths."""
     found = [(event.t, f"{event.robot} died", "mark bad") for event in of_kind(loaded.events, AgentDied)]
+    found += [(span.to_s, "merge taken back", "mark bad") for span in report.merges_taken_back]
     if report.merged_after_s is not None:
         found.append((report.merged_after_s, f"one map after {seconds(report.merged_after_s)}", "mark"))
     return sorted(found)

@@ -29,6 +29,13 @@ class Closures(Record):
     """Closures that the last optimisation rejected as outliers."""
 
 
+class Span(Record):
+    """A time from its beginning to its end."""
+
+    from_s: float
+    to_s: float
+
+
 class LeaderSpan(Record):
     """One term: who led, and from the first robot that followed to the last one that stopped."""
 
@@ -157,7 +164,9 @@ class RunReport(Record):
     map_frames: list[str]
     """Frames of the robots that lived to the end, each named once; a robot that was never corrected adds none."""
     merged_after_s: float | None
-    """When all living robots first were in one map frame (two robots at least)."""
+    """From when on all living robots were in one map frame (two robots at least), until the end."""
+    merges_taken_back: list[Span] = Field(default_factory=list)
+    """From when to when they were before, where a robot left the frame again."""
     closures: Closures
     ate_joint_m: float | None
     """All robots that lived to the end (all, where none did), one SE(3) alignment for all; null unless each of them is

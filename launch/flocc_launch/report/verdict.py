@@ -14,6 +14,7 @@ def verdict(report: RunReport) -> str:
         misplaced_sentence(report),
         *report.doubted_places.values(),
         map_sentence(report),
+        taken_back_sentence(report),
         error_sentence(report),
         camera_sentence(report),
     )
@@ -72,6 +73,19 @@ def map_sentence(report: RunReport) -> str:
     unplaced = f" and {word(apart)} without any" if apart else ""
     return sentence(
         f"{who}the robots did not merge: {word(maps)} separate map{'s' * (maps != 1)} at the end{unplaced}."
+    )
+
+
+def taken_back_sentence(report: RunReport) -> str:
+    """That robots were in one map before, and no more."""
+    spans = report.merges_taken_back
+    if not spans:
+        return ""
+    last = f"from {seconds(spans[-1].from_s)} to {seconds(spans[-1].to_s)}"
+    if len(spans) == 1:
+        return f"They had been in one map {last}; that merge was taken back."
+    return (
+        f"They had been in one map {word(len(spans))} times before, last {last}; each of these merges was taken back."
     )
 
 

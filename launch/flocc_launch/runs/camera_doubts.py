@@ -34,6 +34,10 @@ ADVICE = {
         "they show it, leaves it out from the first."
     ),
     "frozen": "They were not used. Look at the camera, its cable and its driver.",
+    "standing": (
+        "They were not used. Look at what drives it and at odometry: wheels that slip or are blocked turn on. If it "
+        "did move, look at the camera's stream, which then repeats a picture and codes it anew."
+    ),
 }
 
 
@@ -91,6 +95,10 @@ def _sentence(robot: str, fact: CameraDoubted) -> str:
         "mixed frames": f"{robot}'s odometry moves in other directions than its pictures, though both turn alike.",
         "overlay": f"{share} of {robot}'s pictures ({fact.where}) move with the camera: {_guess(fact)}.",
         "frozen": f"{fact.amount:.0f} or more pictures of {robot} are ones that it took before, though it had moved.",
+        "standing": (
+            f"{fact.amount:.0f} or more pictures of {robot} show what one before did, but for the camera's noise: it "
+            "stood still while its odometry went on."
+        ),
     }
     said = sentences.get(fact.doubt, f"{robot}'s camera: {fact.doubt} {fact.amount:g} {fact.where}".rstrip() + ".")
     return f"{said} {KEPT_OUT}" if fact.withheld else said

@@ -113,24 +113,79 @@ def links(events: Events, until_s: float) -> list[Link]:
     return sorted(found, key=lambda link: (link.robot, link.peer, link.from_s))
 
 
-def merged_after_s(events: Events, robots: Iterable[str]) -> float | None:
-    """When all living robots first were in one map frame, two robots at least; None if never.
+@dataclass(frozen=True, slots=True)
+class Merges:
+    """When all living robots were in one map frame, two robots at least.
+
+    Attributes:
+        after_s: From when on, until the end; None where they are not in one at the end.
+        taken_back: From when to when they were, each time that a robot left the frame again.
+    """
+
+    after_s: float | None
+    taken_back: tuple[tuple[float, float], ...] = ()
+
+
+def merges_of(events: Events, robots: Iterable[str]) -> Merges:
+    """When the robots of a run merged, and which merges did not last.
 
     A robot counts from the start of the run, also before its first keyframe, until it dies; it comes back with
-    its next keyframe.
+    its next keyframe, and what it does until it is in the others' frame again takes no merge back. Nor does it when all
+    go over into another frame, as they do when their map finds an older one.
     """
-    alive = set(robots)
-    frames: dict[str, str] = {}
+    merging = _Merging(set(robots))
     for event in events:
+        merging.on_event(event)
+    return merging.found()
+
+
+class _Merging:
+    """Robots and their map frames, event by event."""
+
+    def __init__(self, robots: set[str]) -> None:
+        self._alive = robots
+        self._returning: set[str] = set()
+        self._frames: dict[str, str] = {}
+        self._frame = ""
+        self._from_s: float | None = None
+        self._left_s: float | None = None
+        self._meanwhile: set[str] = set()
+        self._taken_back: list[tuple[float, float]] = []
+
+    def on_event(self, event: Reported[Fact]) -> None:
         if isinstance(event.fact, CorrectionApplied):
-            frames[event.robot] = event.fact.map_frame
+            self._frames[event.robot] = event.fact.map_frame
+            self._meanwhile.add(event.fact.map_frame)
         elif isinstance(event.fact, AgentDied):
-            alive.discard(event.robot)
-        elif isinstance(event.fact, KeyframeTaken):
-            alive.add(event.robot)
-        if len(alive) > 1 and len({frames.get(robot) for robot in alive}) == 1 and alive <= frames.keys():
-            return event.t
-    return None
+            self._alive.discard(event.robot)
+            self._frames.pop(event.robot, None)
+        elif isinstance(event.fact, KeyframeTaken) and event.robot not in self._alive:
+            self._alive.add(event.robot)
+            self._returning |= {event.robot} if self._from_s is not None else set()
+        else:
+            return
+        self._returning = {robot for robot in self._returning if self._frames.get(robot) != self._frame}
+        frames = {self._frames.get(robot) for robot in self._alive - self._returning}
+        if self._from_s is None or self._left_s is not None:
+            (frame,) = frames if len(frames) == 1 else (None,)
+            if frame is not None and len(self._alive) > 1:
+                self._on_one(frame, event.t)
+        elif frames - {self._frame}:
+            self._left_s, self._meanwhile = event.t, {frame for frame in frames if frame is not None}
+
+    def _on_one(self, frame: str, t: float) -> None:
+        """All are in one frame, and were not before."""
+        went_over = frame != self._frame and self._meanwhile <= {self._frame, frame}
+        if self._from_s is not None and self._left_s is not None and not went_over:
+            self._taken_back.append((self._from_s, self._left_s))
+            self._from_s = None
+        self._from_s = t if self._from_s is None else self._from_s
+        self._frame, self._left_s = frame, None
+
+    def found(self) -> Merges:
+        if self._from_s is None or self._left_s is None:
+            return Merges(self._from_s, tuple(self._taken_back))
+        return Merges(None, (*self._taken_back, (self._from_s, self._left_s)))
 
 
 def ends(events: Events) -> Mapping[str, End]:

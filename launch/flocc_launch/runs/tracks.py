@@ -8,10 +8,13 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.reports import Fact, KeyframeTaken
 from flocc_agent.geometry import pose_from_tq
-from flocc_agent.runtime.event_lines import Reported, of_kind
-from flocc_agent.runtime.robot_result import RobotResult, stacked_poses
+from flocc_agent.runtime.event_lines import Reported, is_of, of_kind
+from flocc_agent.runtime.facts import AgentDied
+from flocc_agent.runtime.robot_result import LostRobot, RobotResult, stacked_poses
 from flocc_agent.runtime.trajectory import Trajectory
+from flocc_launch.runs.timeline import ends
 from flocc_launch.runs.trajectory_errors import associate, placed_at_true_start
+from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -66,15 +69,30 @@ class RobotTrack:
 def tracks_of(
     truths: Mapping[str, Trajectory | None], results: Mapping[str, RobotResult], events: Sequence[Reported[Fact]]
 ) -> dict[str, RobotTrack]:
-    """Put together every robot's track; one that left no result has the odometry of its `keyframe` events."""
+    """Put together every robot's track; one that left no result has the odometry of its `keyframe` events.
+
+    One that died before it was corrected, or in another map, is where survivors have it that no longer heard it.
+    """
     taken = of_kind(events, KeyframeTaken)
+    lost, died = lost_robots(results), {name for name, end in ends(events).items() if is_of(end, AgentDied)}
     tracks = {}
     for robot, truth in sorted(truths.items()):
         if robot in results:
-            tracks[robot] = track_of_result(results[robot], truth)
+            track = track_of_result(results[robot], truth)
         else:
-            tracks[robot] = track_of_events([event.fact for event in taken if event.robot == robot], robot, truth)
+            track = track_of_events([event.fact for event in taken if event.robot == robot], robot, truth)
+        there = lost.get(str(LogId(robot, track.incarnation)))
+        if robot in died and there is not None and len(track) and there.map_frame != track.map_frame:
+            at = there.T_map_body(track.T_odom_body)
+            track = completed(robot, track.incarnation, there.map_frame, track.stamps_s, track.T_odom_body, at, truth)
+        tracks[robot] = track
     return tracks
+
+
+def lost_robots(results: Mapping[str, RobotResult]) -> dict[str, LostRobot]:
+    """Where survivors have each log that they no longer heard; best by who solved it, then by the latest round."""
+    told = [lost for _, result in sorted(results.items()) for lost in result.lost]
+    return {lost.log: lost for lost in sorted(told, key=lambda lost: (bool(lost.knots), lost.term, lost.round))}
 
 
 def track_of_result(result: RobotResult, truth: Trajectory | None) -> RobotTrack:

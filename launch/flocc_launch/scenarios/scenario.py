@@ -270,7 +270,7 @@ class Expectations(Section):
     """What must come true; a run that misses one ends with exit code 1."""
 
     merged_within_s: float | None = Field(None, gt=0)
-    """All robots share one map frame at the latest this long after the start."""
+    """All robots share one map frame at the latest this long after the start, and until the end."""
     ate_max_m: float | None = Field(None, gt=0)
     """Joint ATE, one SE(3) alignment for all robots."""
     ate_ratio_max: float | None = Field(None, gt=0)

@@ -1,7 +1,7 @@
 """Claims on measured factors: they correct, join maps where they fix all that is open, and wrong ones are named."""
 
 import pickle
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from flocc_agent.core.pose_graph import (
     Trajectory,
     landmark,
 )
-from flocc_agent.geometry import Float, inverse, pose, se3_exp, so3_exp
+from flocc_agent.geometry import Float, inverse, pose, pose_from_tq, se3_exp, so3_exp, tq_from_pose
 from flocc_protocol.ids import KeyframeId, LogId
 
 R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
@@ -58,6 +58,11 @@ def sighting(log: LogId, index: int, T_world_tag: Float, tag: str = "7") -> Meas
     return MeasuredFactor("tag", at, at, landmark(f"tag/{tag}"), T_camera_tag, TIGHT)
 
 
+def twice(log: LogId, index: int, T_world_tag: Float) -> list[MeasuredFactor]:
+    """A tag seen from two keyframes, one after the other."""
+    return [sighting(log, index, T_world_tag), sighting(log, index + 1, T_world_tag)]
+
+
 def seen(log: LogId, index: int, other: LogId, other_index: int, whole: bool) -> MeasuredFactor:
     at, match = KeyframeId(log, index), KeyframeId(other, other_index)
     T_match = inverse(T[log][index]) @ T[other][other_index]
@@ -72,9 +77,9 @@ def fix(log: LogId, index: int, off_m: float = 0.0) -> MeasuredFactor:
     return MeasuredFactor("fix", at, landmark(WORLD), at, pose(np.eye(3), position), 1e-4 * np.eye(3))
 
 
-def start(log: LogId) -> MeasuredFactor:
-    at = KeyframeId(log, 0)
-    return MeasuredFactor("pose", at, landmark(WORLD), at, T[log][0], TIGHT)
+def start(log: LogId, index: int = 0) -> MeasuredFactor:
+    at = KeyframeId(log, index)
+    return MeasuredFactor("pose", at, landmark(WORLD), at, T[log][index], TIGHT)
 
 
 def solved(given: PoseGraph, initial: GraphSolution | None = None) -> GraphSolution:
@@ -101,14 +106,87 @@ TAG = pose(so3_exp(np.array([0.3, 0.0, 1.0])), np.array([2.0, 3.0, 1.0]))
 
 
 def test_two_robots_that_saw_one_tag_end_in_one_frame() -> None:
-    solution = solved(graph([R1, R2], [sighting(R1, 15, TAG), sighting(R2, 3, TAG)]))
+    solution = solved(graph([R1, R2], [*twice(R1, 15, TAG), *twice(R2, 3, TAG)]))
     assert groups(solution) == [["r1", "r2"]]
     assert joint_error_m(solution) < 0.01
     assert solution.components[0].map_frame == "map/r1"
     T_map_tag = solution.components[0].T_map_landmark["tag/7"]
     T_world_map = T[R1][0] @ inverse(solution.components[0].T_map_keyframe[R1][0])
     np.testing.assert_allclose(T_world_map @ T_map_tag, TAG, atol=1e-3)
-    assert [result.state for result in solution.measured] == [ClosureState.USED] * 2
+    assert [result.state for result in solution.measured] == [ClosureState.USED] * 4
+
+
+@pytest.mark.parametrize("times", [(1, 1), (1, 2), (2, 1)])
+def test_one_sighting_of_a_tag_alone_joins_no_maps_and_is_named(times: tuple[int, int]) -> None:
+    """It may be wrong, and nothing contradicts it; a second one that agrees, or a closure, is needed on both sides."""
+    once = [twice(R1, 15, TAG)[: times[0]], twice(R2, 3, TAG)[: times[1]]]
+    solution = solved(graph([R1, R2], [*once[0], *once[1]]))
+    assert groups(solution) == [["r1"], ["r2"]]
+    lonely = [result for result in solution.measured if result.state is not ClosureState.USED]
+    assert [result.reason for result in lonely] == ["fewer than 2 closures or sightings that agree join these maps"]
+    assert f"{lonely[0].factor} is not used: {lonely[0].reason}" in solution.warnings
+    with_tag = [component.logs for component in solution.components if "tag/7" in component.T_map_landmark]
+    assert len(with_tag) == 1, "the tag stands where the other one saw it"
+
+
+def test_two_tags_seen_once_each_by_both_join() -> None:
+    elsewhere = TAG @ se3_exp(np.array([0.0, 0.5, 0.0, 1.0, 2.0, 0.0]))
+    both = [sighting(log, k, T, tag) for log, k in ((R1, 15), (R2, 3)) for tag, T in (("7", TAG), ("8", elsewhere))]
+    solution = solved(graph([R1, R2], both))
+    assert groups(solution) == [["r1", "r2"]]
+    assert joint_error_m(solution) < 0.01
+
+
+def test_who_takes_one_sighting_as_enough_may() -> None:
+    once = graph([R1, R2], [sighting(R1, 15, TAG), sighting(R2, 3, TAG)])
+    solution = optimise(once, CONFIG.model_copy(update={"closures_to_join_min": 1}))
+    assert isinstance(solution, GraphSolution)
+    assert groups(solution) == [["r1", "r2"]]
+
+
+def test_a_wrong_sighting_that_came_first_joins_nothing_and_the_next_ones_are_right() -> None:
+    wrong = sighting(R2, 3, TAG @ se3_exp(np.array([0.0, 0.0, 0.4, 2.0, 0.0, 0.0])))
+    seen_by_r1 = twice(R1, 15, TAG)
+    assert groups(solved(graph([R1, R2], [*seen_by_r1, wrong]))) == [["r1"], ["r2"]]
+    assert groups(solved(graph([R1, R2], [*seen_by_r1, wrong, sighting(R2, 4, TAG)]))) == [["r1"], ["r2"]]
+    solution = solved(graph([R1, R2], [*seen_by_r1, wrong, *twice(R2, 4, TAG), sighting(R2, 6, TAG)]))
+    assert groups(solution) == [["r1", "r2"]]
+    assert joint_error_m(solution) < 0.01
+
+
+QUARTERS = [0, 1, 2, 7, 8, 9, 14, 15, 16]
+"""Keyframes that look every way."""
+
+
+def other_order(T_body_tag: Float) -> Float:
+    """What is read of a quaternion that was written x y z w."""
+    x, y, z, w = tq_from_pose(T_body_tag)[[4, 5, 6, 3]]
+    return pose_from_tq(np.array([*T_body_tag[:3, 3], x, y, z, w]))
+
+
+def farther(T_body_tag: Float) -> Float:
+    return pose(T_body_tag[:3, :3], 1.5 * T_body_tag[:3, 3])
+
+
+@pytest.mark.parametrize(
+    ("misread", "told"),
+    [
+        (other_order, "though positions are right: in T_body_tag the quaternion's order is w x y z"),
+        (inverse, "though distances are right: is T_body_tag inverted"),
+        (farther, "and all have them 1.50 times as far: is a size or a unit wrong?"),
+    ],
+)
+def test_sightings_that_are_all_misread_are_one_sentence_that_says_how(
+    misread: Callable[[Float], Float], told: str
+) -> None:
+    right = [sighting(R1, k, TAG) for k in QUARTERS]
+    wrong = [replace(s, T_query_match=misread(s.T_query_match)) for k in QUARTERS for s in [sighting(R2, k, TAG)]]
+    poses = [start(log, k) for log in (R1, R2) for k in range(KEYFRAMES)]
+    solution = solved(graph([R1, R2], [*right, *wrong, *poses]))
+    (warning,) = solution.warnings
+    assert warning.startswith("none of the 9 sightings of tags at r2 agree with the rest of the map, ")
+    assert told in warning
+    assert joint_error_m(solution) < 0.01
 
 
 def test_robots_that_saw_different_tags_stay_apart() -> None:
@@ -133,15 +211,17 @@ def test_one_wrong_tag_sighting_among_three_is_rejected_and_named() -> None:
 
 def test_one_wrong_sighting_of_a_tag_does_not_part_two_robots_that_it_joins() -> None:
     wrong = sighting(R2, 18, TAG @ se3_exp(np.array([0.0, 0.0, 0.4, 2.0, 0.0, 0.0])))
-    right = [sighting(R1, 2, TAG), sighting(R2, 4, TAG), sighting(R2, 9, TAG)]
+    right = [*twice(R1, 2, TAG), sighting(R2, 4, TAG), sighting(R2, 9, TAG)]
     solution = solved(graph([R1, R2], [*right, wrong]))
     assert groups(solution) == [["r1", "r2"]]
-    assert [result.state is ClosureState.USED for result in solution.measured] == [True, True, True, False]
+    assert [result.state is ClosureState.USED for result in solution.measured] == [True] * 4 + [False]
     assert joint_error_m(solution) < 0.01
 
 
 def test_two_robots_of_which_one_saw_the_other_whole_end_in_one_frame() -> None:
-    solution = solved(graph([R1, R2], [seen(R1, 4, R2, 7, whole=True)]))
+    once = seen(R1, 4, R2, 7, whole=True)
+    assert groups(solved(graph([R1, R2], [once]))) == [["r1"], ["r2"]]
+    solution = solved(graph([R1, R2], [once, seen(R2, 8, R1, 5, whole=True)]))
     assert groups(solution) == [["r1", "r2"]]
     assert joint_error_m(solution) < 0.01
 
@@ -247,7 +327,7 @@ def test_an_edge_of_exact_odometry_moves_less_than_the_others() -> None:
 
 
 def test_a_round_starts_from_the_one_before_with_its_landmarks() -> None:
-    given = graph([R1, R2], [sighting(R1, 15, TAG), sighting(R2, 3, TAG), start(R1)])
+    given = graph([R1, R2], [*twice(R1, 15, TAG), *twice(R2, 3, TAG), start(R1)])
     first = solved(given)
     again = solved(given, first)
     assert again.iterations < first.iterations
@@ -257,15 +337,18 @@ def test_a_round_starts_from_the_one_before_with_its_landmarks() -> None:
 
 
 def test_a_metric_closure_joins_and_is_weighed() -> None:
-    at, match = KeyframeId(R1, 3), KeyframeId(R2, 8)
-    T_match = inverse(T[R1][3]) @ T[R2][8]
-    solution = solved(graph([R1, R2], [MeasuredFactor("closure", at, at, match, T_match, TIGHT)]))
+    measured = []
+    for i, j in ((3, 8), (4, 9)):
+        at, match = KeyframeId(R1, i), KeyframeId(R2, j)
+        measured.append(MeasuredFactor("closure", at, at, match, inverse(T[R1][i]) @ T[R2][j], TIGHT))
+    assert groups(solved(graph([R1, R2], measured[:1]))) == [["r1"], ["r2"]]
+    solution = solved(graph([R1, R2], measured))
     assert groups(solution) == [["r1", "r2"]]
     assert joint_error_m(solution) < 0.01
 
 
 def test_a_graph_with_landmarks_is_sent_to_a_worker_and_back() -> None:
-    given = graph([R1, R2], [sighting(R1, 15, TAG), sighting(R2, 3, TAG)])
+    given = graph([R1, R2], [*twice(R1, 15, TAG), *twice(R2, 3, TAG)])
     sent = pickle.loads(pickle.dumps(given))  # our own bytes
     solution = pickle.loads(pickle.dumps(solved(sent)))
     assert groups(solution) == [["r1", "r2"]]

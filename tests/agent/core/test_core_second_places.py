@@ -141,3 +141,16 @@ def test_all_robots_doubt_alike_whatever_comes_first() -> None:
     for i, j in ((15, 11), (14, 10)):
         later.closes(i, j)
     assert first.doubts() == later.doubts() != {}
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_the_graph_doubts_what_a_look_at_odometry_doubts(seed: int) -> None:
+    """The graph's builder passes over logs of which numbers alone say that nothing is doubted."""
+    rng = np.random.default_rng(seed)
+    team = joined(*{tuple(pair) for pair in rng.integers(0, LENGTH, size=(int(rng.integers(2, 7)), 2)).tolist()})
+    for i, j in rng.integers(0, LENGTH, size=(int(rng.integers(0, 60)), 2)).tolist():
+        team.refuses(i, j)
+        team.refuses(i, max(i - 4, 0))
+    told = team.doubts()
+    looked = team.graph._tentative.of(A, B).doubted
+    assert told == {(pair.low.index, pair.high.index): why for pair, why in looked.items()}

@@ -334,6 +334,21 @@ def test_a_frozen_picture_is_not_encoded_and_told_at_the_second_one() -> None:
     assert "taken before" in looks[4].fault
 
 
+def test_a_robot_that_stands_while_odometry_goes_on_has_no_frozen_camera() -> None:
+    """Noise of one grey level: another picture of the same place."""
+    perception = build_perception(PerceptionConfig())
+    watch, rng = CameraWatch(), np.random.default_rng(7)
+    poses = turning(6)
+    noisy = [
+        np.clip(picture(poses[min(k, 3)], _texture(3)) + rng.normal(0.0, 1.0, (240, 320)), 0.0, 255.0).astype(np.uint8)
+        for k in range(6)
+    ]
+    looks = [watch.look(perception, image_of(pixels), T) for pixels, T in zip(noisy, poses, strict=True)]
+    assert [look.latent is None for look in looks] == [False, False, False, False, True, True]
+    assert [(doubt.doubt, doubt.amount) for look in looks for doubt in look.doubts] == [("standing", 2)]
+    assert "though by odometry" in looks[4].fault
+
+
 def test_a_standing_robot_may_see_the_same_twice() -> None:
     finder = OverlayFinder(CAMERA)
     T = turning(1)[0]

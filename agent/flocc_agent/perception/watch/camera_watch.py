@@ -1,13 +1,13 @@
 """Watches one robot's camera while its keyframes are encoded: what it tells is said once, by name and figure.
 
-Three looks. Is the picture one that was seen before? Then it is not encoded: it would be a place where the robot is
-not. Does part of it stay while the robot turns? Then features and place descriptor leave that part out from now on. Do
-motions between consecutive keyframes agree with odometry's? The first ones are all looked at, later ones now and then,
-since a camera can be knocked, or zoomed, on the way. As long as they say that its axes are others than odometry's, its
-keyframes carry odometry only: closures with them would put the robot where it is not.
+Three looks. Does the picture show what one before did, though the robot moved? Then it is not encoded: it would be a
+place where the robot is not. Does part of it stay while the robot turns? Then features and place descriptor leave that
+part out from now on. Do motions between consecutive keyframes agree with odometry's? The first ones are all looked at,
+later ones now and then, since a camera can be knocked, or zoomed, on the way. As long as they say that its axes are
+others than odometry's, its keyframes carry odometry only: closures with them would put the robot where it is not.
 """
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
@@ -26,7 +26,7 @@ from flocc_agent.perception.watch.camera_verdict import (
     camera_verdict,
     shows_camera,
 )
-from flocc_agent.perception.watch.overlay import OverlayFinder, place_of
+from flocc_agent.perception.watch.overlay import OverlayFinder, Repeat, place_of
 from flocc_agent.perception.watch.seen_motion import Flow
 from flocc_agent.stages import stage
 
@@ -48,6 +48,11 @@ OVERLAY_STEP_RATIO = 0.1
 """An overlay is told again when it turns out larger by so much."""
 FOCAL_STEP_RATIO = 0.04
 """A focal length is told again when it turns out to be off from what was told by so much."""
+REPEATED = {
+    Repeat.SAME_PICTURE: ("frozen", "the picture is one that was taken before, though the robot moved"),
+    Repeat.SAME_VIEW: ("standing", "the picture shows what one before did, though by odometry the robot moved"),
+}
+"""What is doubted of a picture that repeats, and why it is not encoded."""
 TOLD_MAX = 16
 """Doubts that one start of an agent tells."""
 
@@ -77,7 +82,7 @@ class CameraWatch:
         self._before: tuple[bytes, Float] | None = None
         self._pairs: deque[WatchedPair] = deque(maxlen=PAIRS_MAX)
         self._seen = 0
-        self._repeats = 0
+        self._repeats = Counter[Repeat]()
         self._told: list[CameraDoubted] = []
         self._withheld = False
         self._looked = 0
@@ -95,11 +100,10 @@ class CameraWatch:
         self._looked += 1
         if isinstance(perception.registrar, SeesFlow):
             with stage("watch"):
-                repeats = self._look_at(image, T_odom_camera)
-                doubts += self._repeated() if repeats else self._overlay()
-            if repeats:
-                reason = "the picture is one that was taken before, though the robot moved"
-                return KeyframeLook(None, None, reason, tuple(doubts))
+                repeat = self._look_at(image, T_odom_camera)
+                doubts += self._overlay() if repeat is None else self._repeated(repeat)
+            if repeat is not None:
+                return KeyframeLook(None, None, REPEATED[repeat][1], tuple(doubts))
         told = any(doubt.doubt == "overlay" for doubt in doubts)
         image = self._upright(self._without_hidden(image), T_odom_camera)
         with stage("describe"):
@@ -114,8 +118,8 @@ class CameraWatch:
         hidden = image.hidden if told else None
         return KeyframeLook(descriptor, latent, "", tuple(doubts), hidden, 0 if hidden is None else earlier)
 
-    def _look_at(self, image: Image, T_odom_camera: Float) -> bool:
-        """Take the picture in; whether it repeats an earlier one."""
+    def _look_at(self, image: Image, T_odom_camera: Float) -> Repeat | None:
+        """Take the picture in; how it repeats an earlier one."""
         if self._finder is None:
             self._finder = OverlayFinder(image.camera)
         grey = np.asarray(cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY), np.uint8)
@@ -133,11 +137,12 @@ class CameraWatch:
         """The image with the direction against gravity, where odometry knows it."""
         return image if self._up_odom is None else replace(image, up=T_odom_camera[:3, :3].T @ self._up_odom)
 
-    def _repeated(self) -> list[CameraDoubted]:
-        self._repeats += 1
-        if self._repeats not in REPEATS_TOLD:
+    def _repeated(self, repeat: Repeat) -> list[CameraDoubted]:
+        self._repeats[repeat] += 1
+        count = self._repeats[repeat]
+        if count not in REPEATS_TOLD:
             return []
-        return self._tell(CameraDoubted(doubt="frozen", amount=self._repeats, where="", pairs=self._repeats))
+        return self._tell(CameraDoubted(doubt=REPEATED[repeat][0], amount=count, where="", pairs=count))
 
     def _overlay(self) -> list[CameraDoubted]:
         """Tell of cells that stay, the first time and when they turn out to be many more."""

@@ -8,11 +8,14 @@ itself a few pixels on. What is out there correlates with nothing on average; wh
 it lets the scene shine through, or if a part of it changes, only a little less. A robot that only drives straight shows
 nothing, and nothing is hidden.
 
-Two pictures whose cells all stay are one picture: the camera is frozen.
+Two pictures whose cells all stay show the same from the same place. Where they are equal to the last pixel it is one
+picture, which came twice: a camera's noise is never the same. Where they are not, the robot stood still.
 """
 
+import hashlib
 from collections import deque
 from dataclasses import dataclass
+from enum import Enum
 
 import cv2
 import numpy as np
@@ -64,10 +67,23 @@ TESTS_MAX = 40
 """Old tests fade beyond this: dirt may be wiped off."""
 
 
+class Repeat(Enum):
+    """How a picture can be one that was seen before, though by odometry the robot is elsewhere."""
+
+    SAME_PICTURE = "same picture"
+    """Equal to the last pixel: the stream is frozen."""
+    SAME_VIEW = "same view"
+    """Another picture of the same: the robot stands still, and odometry goes on."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Picture:
-    """A reduced picture, what its windows have, how the camera stood, and its way to there in m and rad."""
+    """A reduced picture, what its windows have, how the camera stood, and its way to there in m and rad.
 
+    `digest` is of all pixels before they were reduced.
+    """
+
+    digest: bytes
     grey: Float32
     mean: Float32
     deviation: Float32
@@ -97,8 +113,8 @@ class OverlayFinder:
         self._tests = np.zeros(grid_x.shape)
         self._stayed = np.zeros(grid_x.shape)
 
-    def add(self, grey: NDArray[np.uint8], T_odom_camera: Float) -> bool:
-        """Look at the next picture; whether it is one that was seen before, pixel by pixel.
+    def add(self, grey: NDArray[np.uint8], T_odom_camera: Float) -> Repeat | None:
+        """Look at the next picture; whether it shows the same as one before, though the robot moved by odometry.
 
         Args:
             grey: (H, W) of the whole picture.
@@ -109,12 +125,13 @@ class OverlayFinder:
         self._path_m += float(np.linalg.norm(T_last[:3, 3]))
         self._turned_rad += angle_rad(T_last[:3, :3])
         now = self._picture(grey, T_odom_camera)
-        repeats = any(self._is_same(now, earlier) for earlier in self._earlier)
-        if not repeats:
-            for earlier in self._earlier:
-                self._test(now, earlier)
-            self._earlier.append(now)
-        return repeats
+        same = [earlier.digest for earlier in self._earlier if self._is_same(now, earlier)]
+        if same:
+            return Repeat.SAME_PICTURE if now.digest in same else Repeat.SAME_VIEW
+        for earlier in self._earlier:
+            self._test(now, earlier)
+        self._earlier.append(now)
+        return None
 
     def mask(self, size_px: tuple[int, int]) -> Mask:
         """(H, W) pixels of a picture of this width and height that move with the camera."""
@@ -138,7 +155,8 @@ class OverlayFinder:
         right, down = _fine_gradient(reduced)
         squares = self._averaged(right * right), self._averaged(right * down), self._averaged(down * down)
         way = self._path_m, self._turned_rad
-        return _Picture(reduced, mean, deviation, has_corners, (right, down), squares, T_odom_camera, way)
+        digest = hashlib.blake2b(grey.tobytes(), digest_size=16).digest()
+        return _Picture(digest, reduced, mean, deviation, has_corners, (right, down), squares, T_odom_camera, way)
 
     def _test(self, now: _Picture, earlier: _Picture) -> None:
         """Add how much of each cell stays between two pictures, of those that the motion must have moved."""
