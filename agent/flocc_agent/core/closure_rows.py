@@ -203,6 +203,13 @@ class ClosureTable:
         of_log = self._ends.get(log)
         return 0 if of_log is None else bisect_left(of_log, end * ROWS_MAX) - bisect_left(of_log, first * ROWS_MAX)
 
+    def mark(self, log: LogId, first: int, end: int) -> int:
+        """A number of the same closures that is another one when one comes, leaves or is registered anew."""
+        of_log = self._ends.get(log)
+        if of_log is None:
+            return 0
+        return sum(of_log[bisect_left(of_log, first * ROWS_MAX) : bisect_left(of_log, end * ROWS_MAX)])
+
     def near(self, log: LogId, first: int, end: int) -> list[End]:
         """Those of them that have a length."""
         of_log = self._ends.get(log)

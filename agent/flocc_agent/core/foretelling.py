@@ -79,12 +79,12 @@ class Foretelling:
         """How many logs closures are of."""
         return self._closures.logs_count()
 
-    def ends(self, keyframe: KeyframeId, reach: int) -> int:
-        """Ends of closures in a stretch, whatever log is at their other ends."""
-        return self._closures.ends(keyframe.log, max(keyframe.index - reach, 0), keyframe.index + reach + 1)
+    def mark(self, keyframe: KeyframeId, reach: int) -> int:
+        """A number of the closures of a stretch that is another one when these change."""
+        return self._closures.mark(keyframe.log, max(keyframe.index - reach, 0), keyframe.index + reach + 1)
 
     def density(self, keyframe: KeyframeId, reach: int) -> float:
-        """The same for each keyframe of the stretch."""
+        """Ends of closures for each keyframe of a stretch, whatever log is at their other ends."""
         track = self._track(keyframe.log)
         if track is None or not self._known(keyframe):
             return 0.0
@@ -97,14 +97,21 @@ class Foretelling:
         Nothing where there are fewer ways than the least that matters.
         """
         if not self._known(pair.low) or not self._known(pair.high):
-            return Foretold.nothing()
+            return Foretold.nothing(is_whole=False)
         low, high = self._stretch(pair.low, reach), self._stretch(pair.high, reach)
-        chains = self._direct(pair, low, reach) + self._by_third(pair, low, high, reach)
-        return self._said(pair, chains) if len(chains) >= max(least, 1) else Foretold.nothing()
+        known = [[end for end in ends if self._is_known(log, end)] for log, ends in (low, high)]
+        is_whole = all(len(ends) == len(each) for (_, ends), each in zip((low, high), known, strict=True))
+        chains = self._direct(pair, known[0], reach) + self._by_third(pair, *known, reach)
+        if len(chains) < max(least, 1):
+            return Foretold.nothing(is_whole)
+        return self._said(pair, chains, is_whole)
 
-    def _stretch(self, keyframe: KeyframeId, reach: int) -> list[End]:
-        ends = self._closures.near(keyframe.log, max(keyframe.index - reach, 0), keyframe.index + reach + 1)
-        return [end for end in ends if self._known(KeyframeId(keyframe.log, end.near))]
+    def _stretch(self, keyframe: KeyframeId, reach: int) -> tuple[LogId, list[End]]:
+        log, index = keyframe
+        return log, self._closures.near(log, max(index - reach, 0), index + reach + 1)
+
+    def _is_known(self, log: LogId, end: End) -> bool:
+        return self._known(KeyframeId(log, end.near)) and self._known(end.far)
 
     def _direct(self, pair: CandidatePair, low: list[End], reach: int) -> list[_Chain]:
         """Closures between both stretches, those beside the pair first."""
@@ -112,7 +119,7 @@ class Foretelling:
         found = [
             _Chain(abs(end.near - pair.low.index) + abs(end.far.index - at), end, None)
             for end in low
-            if end.far.log == log and abs(end.far.index - at) <= reach and self._known(end.far)
+            if end.far.log == log and abs(end.far.index - at) <= reach
         ]
         return _shortest(found)
 
@@ -127,7 +134,7 @@ class Foretelling:
         for end in low:
             for back in of_log.get(end.far.log, ()):
                 apart = abs(end.far.index - back.far.index)
-                if apart > 2 * reach or not (self._known(end.far) and self._known(back.far)):
+                if apart > 2 * reach:
                     continue
                 steps = apart + abs(end.near - pair.low.index) + abs(back.near - pair.high.index)
                 held, chain = best.get(end.far.log), _Chain(steps, end, back)
@@ -135,7 +142,7 @@ class Foretelling:
                     best[end.far.log] = chain
         return _shortest(list(best.values()))
 
-    def _said(self, pair: CandidatePair, chains: list[_Chain]) -> Foretold:
+    def _said(self, pair: CandidatePair, chains: list[_Chain], is_whole: bool) -> Foretold:
         """The poses along chains, and how far off each may be."""
         backs = [chain.high for chain in chains if chain.high is not None]
         direct = len(chains) - len(backs)
@@ -153,7 +160,8 @@ class Foretelling:
         moved_m = _lengths_m(T_low[1:]) + _lengths_m(T_third) + _lengths_m(T_high[1:])
         steps_m = float(_lengths_m(T_low[:1])[0] + _lengths_m(T_high[:1])[0]) / 2
         may_m = AGREE_LENGTHS * (_lengths_m(T_there) + _lengths_m(T_back)) + AGREE_RATIO * moved_m
-        return Foretold(T_low[1:] @ T_there @ T_third @ T_back @ inverse(T_high[1:]), may_m + AGREE_STEPS * steps_m)
+        T_low_high = T_low[1:] @ T_there @ T_third @ T_back @ inverse(T_high[1:])
+        return Foretold(T_low_high, may_m + AGREE_STEPS * steps_m, is_whole)
 
     def _beside(self, keyframe: KeyframeId, others: list[int]) -> tuple[LogId, list[int]]:
         """A keyframe, the one before it or after it, and others of its log."""

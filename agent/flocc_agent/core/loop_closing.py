@@ -145,7 +145,8 @@ class LoopClosing:
         """Pairs that would tell whether two ways are joined rightly: a few come before all others, each once."""
         effects: list[Effect] = []
         candidates = list(candidates)
-        waiting = sum(self._prospects.was_asked(c.pair) and c.pair not in self._resolved for c in candidates)
+        asked = [candidate.pair for candidate in candidates if self._prospects.was_asked(candidate.pair)]
+        waiting = sum(pair not in self._resolved and pair not in self._spared for pair in asked)
         for candidate in candidates:
             if waiting >= ASKED_AT_ONCE:
                 break
@@ -155,12 +156,13 @@ class LoopClosing:
             if self._prospects.was_refused_unseen(pair):
                 self._prospects.on_settled(pair)
                 self._resolved.discard(pair)
-            self._spared.remove(pair)
+            if self._is_due_anyway(pair):
+                self._spared.remove(pair)
             if not self._knows(pair):
                 fact = CandidateFound(query=pair.low, match=pair.high, similarity=round(similarity, 4))
                 effects.append(Report(fact))
                 self._assign(Candidate(pair, ASKED_ORDER), now)
-            waiting += pair not in self._resolved
+            waiting += pair not in self._resolved and pair not in self._spared
         return effects
 
     def on_offer(self, offer: CandidateOffer, now: float) -> None:
@@ -431,12 +433,18 @@ class LoopClosing:
         return known or pair in self._spared
 
     def _spares(self, candidate: Candidate) -> bool:
-        """Whether a pair tells nothing new; then nobody waits for it. One that is asked for is to tell it once more."""
-        if self._prospects.was_asked(candidate.pair) or not self._spared.is_told(candidate.pair):
+        """Whether a pair tells nothing new; then nobody waits for it."""
+        if self._is_due_anyway(candidate.pair) or not self._spared.is_told(candidate.pair):
             return False
         self._spared.add(candidate.pair, candidate.similarity)
         self._told.append(candidate.pair)
         return True
+
+    def _is_due_anyway(self, pair: CandidatePair) -> bool:
+        """Whether a pair is asked for and to be registered here; another robot does not know that it is asked for."""
+        if not self._prospects.was_asked(pair) or self._owner(pair) != self._own:
+            return False
+        return self._reach.stronger(self._compute_class) is None
 
     def _spare_beside(self, closure: CandidatePair) -> None:
         """Spare pairs beside a new closure that nobody began to register here."""

@@ -54,15 +54,17 @@ class Foretold:
     Attributes:
         T_low_high: (K, 4, 4) pose of the later keyframe in the earlier one, metric.
         may_m: (K,) how far off each may be.
+        is_whole: Whether the keyframes of all closures there were known.
     """
 
     T_low_high: Float
     may_m: Float
+    is_whole: bool = True
 
     @classmethod
-    def nothing(cls) -> "Foretold":
+    def nothing(cls, is_whole: bool = True) -> "Foretold":
         """No closure says anything."""
-        return cls(np.empty((0, 4, 4)), np.empty(0))
+        return cls(np.empty((0, 4, 4)), np.empty(0), is_whole)
 
 
 class HeldClosures(Protocol):
@@ -72,12 +74,12 @@ class HeldClosures(Protocol):
         """How many logs closures are of."""
         ...
 
-    def ends(self, keyframe: KeyframeId, reach: int) -> int:
-        """Ends of closures in a stretch, whatever keyframes are at their other ends."""
+    def mark(self, keyframe: KeyframeId, reach: int) -> int:
+        """A number of the closures of a stretch that is another one when these change."""
         ...
 
     def density(self, keyframe: KeyframeId, reach: int) -> float:
-        """The same for each keyframe of the stretch."""
+        """Ends of closures for each keyframe of a stretch, whatever keyframes are at their other ends."""
         ...
 
     def foretold(self, pair: CandidatePair, reach: int, least: int = 1) -> Foretold:
@@ -92,7 +94,7 @@ class NoClosures:
         """None."""
         return 0
 
-    def ends(self, keyframe: KeyframeId, reach: int) -> int:  # noqa: ARG002
+    def mark(self, keyframe: KeyframeId, reach: int) -> int:  # noqa: ARG002
         """None."""
         return 0
 
@@ -120,7 +122,8 @@ class Spared:
         self._enough = enough
         self._logs_min = logs_min
         self._similarities: PairTable[float] = PairTable(SPARED_MAX)
-        self._weak: dict[CandidatePair, int] = {}
+        self._weak: dict[CandidatePair, tuple[int, int]] = {}
+        """What was known of pairs that were not told."""
 
     def __contains__(self, pair: CandidatePair) -> bool:
         return pair in self._similarities
@@ -139,15 +142,16 @@ class Spared:
             return False
         if min(self._held.density(pair.low, STRETCH), self._held.density(pair.high, STRETCH)) < TIED_MIN:
             return False
-        ends = self._held.ends(pair.low, STRETCH) + self._held.ends(pair.high, STRETCH)
-        if self._weak.get(pair) == ends:
+        marks = self._held.mark(pair.low, STRETCH), self._held.mark(pair.high, STRETCH)
+        if self._weak.get(pair) == marks:
             return False
         foretold = self._held.foretold(pair, STRETCH, self._enough)
         agreeing = agreeing_of(foretold)
         if agreeing - CONTRADICTED * (len(foretold.may_m) - agreeing) >= self._enough:
             return True
         self._weak.pop(pair, None)
-        remember(self._weak, pair, ends, LOOKED_MAX)
+        if foretold.is_whole:
+            remember(self._weak, pair, marks, LOOKED_MAX)
         return False
 
     def add(self, pair: CandidatePair, similarity: float) -> None:

@@ -296,6 +296,8 @@ def test_tables_are_bounded() -> None:
     assert road.spared.sizes()["spared"] == (SPARED_MAX, SPARED_MAX)
     assert pair(0, 0) not in road.spared
     assert pair(SPARED_MAX, SPARED_MAX) in road.spared
+    for k in range(KEYFRAMES):
+        road.drives(R3, k)
     for k in range(4):
         road.closes(10 + k, 10 + k, off_m=20.0 * k)
     assert not road.spared.is_told(pair(12, 12))
@@ -440,3 +442,27 @@ def test_a_pair_that_is_asked_for_is_registered_whatever_others_tell(is_spared: 
         closing.on_candidates([Candidate(candidate, 0.9)], 0.0)
     closing.on_asked([Candidate(candidate, 0.9)], 0.0)
     assert registered(closing.tick(0.0)) == [candidate]
+
+
+def test_a_pair_that_is_asked_for_is_not_offered_for_ever_to_a_stronger_robot_that_spares_it() -> None:
+    road = Road()
+    closing, candidate = machine(road), of_r1()[0]
+    closing.on_peer("r9", Peer(5, log=LogId("r9")))
+    closing.on_asked([Candidate(candidate, 0.9)], 0.0)
+    assert [type(effect) for effect in closing.tick(0.0)] == [Unicast]
+    learns(closing, road, TELLING)
+    assert not closing.tick(OFFER_PERIOD_S)
+    assert not closing.open_pairs()
+
+
+def test_a_pair_is_looked_at_again_when_keyframes_of_closures_become_known() -> None:
+    road = Crowd()
+    others = [LogId(f"u{k}") for k in range(ENOUGH)]
+    for log in others:
+        road.meets_both(log, 12, 12)
+        for k in range(12):
+            road.drives(log, k)
+    assert not road.spared.is_told(pair(12, 12))
+    for log in others:
+        road.drives(log, 12)
+    assert road.spared.is_told(pair(12, 12))
