@@ -98,17 +98,18 @@ class Foretelling:
         """
         if not self._known(pair.low) or not self._known(pair.high):
             return Foretold.nothing(is_whole=False)
-        low, high = self._stretch(pair.low, reach), self._stretch(pair.high, reach)
-        known = [[end for end in ends if self._is_known(log, end)] for log, ends in (low, high)]
-        is_whole = all(len(ends) == len(each) for (_, ends), each in zip((low, high), known, strict=True))
-        chains = self._direct(pair, known[0], reach) + self._by_third(pair, *known, reach)
+        around = self._stretch(pair.low, reach), self._stretch(pair.high, reach)
+        both = zip((pair.low.log, pair.high.log), around, strict=True)
+        low, high = ([end for end in ends if self._is_known(log, end)] for log, ends in both)
+        is_whole = len(low) + len(high) == sum(map(len, around))
+        chains = self._direct(pair, low, reach) + self._by_third(pair, low, high, reach)
         if len(chains) < max(least, 1):
             return Foretold.nothing(is_whole)
         return self._said(pair, chains, is_whole)
 
-    def _stretch(self, keyframe: KeyframeId, reach: int) -> tuple[LogId, list[End]]:
+    def _stretch(self, keyframe: KeyframeId, reach: int) -> list[End]:
         log, index = keyframe
-        return log, self._closures.near(log, max(index - reach, 0), index + reach + 1)
+        return self._closures.near(log, max(index - reach, 0), index + reach + 1)
 
     def _is_known(self, log: LogId, end: End) -> bool:
         return self._known(KeyframeId(log, end.near)) and self._known(end.far)
