@@ -10,7 +10,7 @@ little each round.
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -69,7 +69,12 @@ def chained(start_m: Float, start_rad: float, steps_m: Float, turns_rad: Float) 
 
 @dataclass(eq=False)
 class CorrectedRobot:
-    """One robot, what it holds, and where an honest leader puts it."""
+    """One robot, what it holds, and where an honest leader puts it.
+
+    Attributes:
+        others: Corrections of the other logs, as their owners have them.
+        in_short: Of which of them the robot knows the newest pose only, until it asks for the rest.
+    """
 
     rides: int
     step_m: float
@@ -80,6 +85,7 @@ class CorrectedRobot:
     closures: list[ClosureRecord]
     fixes: list[MeasuredFactor]
     others: dict[LogId, LogCorrection]
+    in_short: frozenset[LogId]
 
     def odometry(self, log: LogId) -> Float:
         """T_odom_camera (N, 4, 4)."""
@@ -98,16 +104,27 @@ class CorrectedRobot:
         """They are."""
         return True
 
-    def placed(self, solution: Planar) -> Placed:
-        """The correction that says so."""
-        return Placed(told(OWN, self.anchor, self.odometries[OWN], solution.poses()), self.others)
+    def placed(self, solution: Planar, asked: bool = False) -> Placed:
+        """The correction that says so, with what is known of the others, before or after they were asked."""
+        short = frozenset() if asked else self.in_short
+        known = {log: replace(c, knots=None) if log in short else c for log, c in self.others.items()}
+        return Placed(told(OWN, self.anchor, self.odometries[OWN], solution.poses()), known)
+
+    def contradicts(self, solution: Planar, before: Planar | None = None) -> str | None:
+        """What speaks against a correction, also once the others' poses came, for which a robot then asks."""
+        for asked in (False, True) if self.in_short else (False,):
+            last = None if before is None else self.placed(before, asked)
+            why = contradiction(self.placed(solution, asked), last, self)
+            if why is None:
+                return None
+        return why
 
 
-def told(log: LogId, anchor: LogId, T_odom: Float, T_map: Float, short: bool = False) -> LogCorrection:
+def told(log: LogId, anchor: LogId, T_odom: Float, T_map: Float) -> LogCorrection:
     """A correction as a leader tells it."""
     T_map_odom = T_map[-1] @ np.linalg.inv(T_odom[-1])
     as_told, knots = knots_of(Track(T_odom, T_map, T_map_odom, None))
-    return LogCorrection(log, Term(1, LEADER), 1, anchor, as_told, None if short else knots)
+    return LogCorrection(log, Term(1, LEADER), 1, anchor, as_told, knots)
 
 
 def drawn(rng: np.random.Generator, rides: int) -> CorrectedRobot:
@@ -125,11 +142,15 @@ def drawn(rng: np.random.Generator, rides: int) -> CorrectedRobot:
     truth = chained(np.zeros(2), 0.0, carried, turned)
     odometry = chained(np.zeros(2), 0.0, *_drifted(rng, steps, turns, (0.7, 1.4))).poses()
     odometries, closures, others = {OWN: odometry}, list[ClosureRecord](), dict[LogId, LogCorrection]()
+    in_short = set[LogId]()
     is_anchor = rng.random() < 0.3
     closures += _revisits(rng, truth)
     if not is_anchor or rng.random() < 0.7:
         for k in range(int(rng.integers(1, 4))):
-            closures += _met(rng, truth, LogId("nop"[k] if is_anchor else "anz"[k]), odometries, others)
+            other = LogId("nop"[k] if is_anchor else "anz"[k])
+            closures += _met(rng, truth, other, odometries, others)
+            if rng.random() < 0.5:
+                in_short.add(other)
     anchor = OWN if is_anchor else LogId("a")
     others = {log: LogCorrection(log, c.term, 1, anchor, c.T_map_odom, c.knots) for log, c in others.items()}
     near = [c.query.index for c in closures if c.query.log == OWN and c.match.log != OWN]
@@ -148,6 +169,7 @@ def drawn(rng: np.random.Generator, rides: int) -> CorrectedRobot:
         closures,
         fixes,
         others,
+        frozenset(in_short),
     )
 
 
@@ -210,7 +232,7 @@ def _met(
         steps[k : k + int(rng.uniform(2.0, 50.0))] = 0.0
     steps, turns = _drifted(rng, steps, turns, (0.85, 1.2))
     odometries[other] = chained(at[0], float(heading[0]), steps, turns).poses()
-    others[other] = told(other, other, odometries[other], true.poses(), short=rng.random() < 0.5)
+    others[other] = told(other, other, odometries[other], true.poses())
     apart = np.linalg.norm(at[ends] - truth.at_m[near], axis=1)
     pairs = zip(near.tolist(), ends, apart.tolist(), strict=True)
     return [_closure(KeyframeId(OWN, i), KeyframeId(other, j), m) for i, j, m in pairs]
@@ -373,19 +395,18 @@ def unexplained_m(member: CorrectedRobot, lie: Planar) -> float:
 
 def is_held(member: CorrectedRobot, lie: Planar) -> bool:
     """Whether a lie that comes after an honest correction is not believed."""
-    return contradiction(member.placed(lie), member.placed(member.solution), member) is not None
+    return member.contradicts(lie, member.solution) is not None
 
 
 def slow_reach_m(rng: np.random.Generator, member: CorrectedRobot, lie: Lying, by_m: float) -> tuple[Planar, bool]:
     """The last that was believed of a lie that grows by little each round, and whether it was stopped."""
     seed, step_m = int(rng.integers(2**32)), float(rng.uniform(*ROUND_M))
-    before, last = member.placed(member.solution), member.solution
+    last = member.solution
     for k in range(1, int(by_m / step_m) + 1):
         now = lie(np.random.default_rng(seed), member, k * step_m)
-        placed = member.placed(now)
-        if contradiction(placed, before, member) is not None:
+        if member.contradicts(now, last) is not None:
             return last, True
-        before, last = placed, now
+        last = now
     return last, False
 
 
@@ -423,7 +444,7 @@ def judged(draws: int, first: int = 0, slow: int = 0) -> ErrorRates:
         for k in range(draws):
             rng = np.random.default_rng((first, rides, k))
             member = drawn(rng, rides)
-            why = contradiction(member.placed(member.solution), None, member)
+            why = member.contradicts(member.solution)
             count = table.honest.setdefault(rides, [0, 0])
             count[0] += 1
             count[1] += why is not None

@@ -338,6 +338,19 @@ def test_no_network_but_the_machines_own_is_said(monkeypatch: pytest.MonkeyPatch
     assert network.network_faults(config(multicast=False), "a") == []
 
 
+@pytest.mark.parametrize(
+    ("addresses", "is_fault"), [((), True), (("fd00::7",), True), (("169.254.7.1", "fd00::7"), False)]
+)
+def test_a_machine_with_addresses_of_ipv6_alone_finds_nobody_and_says_so(
+    addresses: tuple[str, ...], is_fault: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(socket, "if_nameindex", lambda: [(1, "lo"), (2, "eth0")])
+    monkeypatch.setattr(network, "_flags", lambda name: 0x1043 if name == "eth0" else 0x49)
+    monkeypatch.setattr(network, "machine_addresses", lambda: frozenset(("eth0", each) for each in addresses))
+    faults = network.network_faults(config(), "a")
+    assert [fault.startswith("no interface has an IPv4 address (up: eth0)") for fault in faults] == [True] * is_fault
+
+
 def test_weights_of_a_user_without_a_home_are_in_the_temporary_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -80,11 +80,11 @@ class Host:
         run(*self.prefix, "ip", "address", "flush", "dev", INTERFACE)
         run(*self.prefix, "ip", "link", "set", INTERFACE, "down")
 
-    def get_address(self, number: int) -> None:
-        """Switch the interface on, with an address of the bridge's network."""
-        self.address = f"{SUBNET}.{number}"
+    def get_address(self, number: int, subnet: str = SUBNET, bits: int = 24) -> None:
+        """Switch the interface on, with an address of the bridge's network, or of another one."""
+        self.address = f"{subnet}.{number}"
         run(*self.prefix, "ip", "link", "set", INTERFACE, "up")
-        run(*self.prefix, "ip", "address", "add", f"{self.address}/24", "dev", INTERFACE)
+        run(*self.prefix, "ip", "address", "add", f"{self.address}/{bits}", "dev", INTERFACE)
 
     def lose(self, probability: float) -> None:
         """Lose this share of the packets that come in."""

@@ -51,6 +51,22 @@ async def test_an_interface_that_comes_up_after_the_agent_is_used(tmp_path: Path
             await reached(robots, lambda: meet(robots), MEET_S, "both hear each other")
 
 
+async def test_robots_with_addresses_of_their_link_meet_and_again_once_they_get_others(tmp_path: Path) -> None:
+    """As where no DHCP server answers at first."""
+    needs_namespaces()
+    with hosts(2) as machines:
+        for number, host in enumerate(machines, 1):
+            host.lose_address()
+            host.get_address(number, "169.254.7", 16)
+        async with running(tmp_path, machines, "auto") as robots:
+            await reached(robots, lambda: meet(robots), MEET_S, "both hear each other")
+            for number, host in enumerate(machines, 1):
+                host.lose_address()
+                host.get_address(number)
+            await reached(robots, lambda: not meet(robots), MEET_S, "they are apart")
+            await reached(robots, lambda: meet(robots), MEET_S, "both hear each other again")
+
+
 @pytest.mark.parametrize("interface", ["auto", INTERFACE])
 async def test_a_robot_whose_address_changes_is_found_again(tmp_path: Path, interface: str) -> None:
     needs_namespaces()

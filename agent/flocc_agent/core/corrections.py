@@ -129,12 +129,16 @@ class Corrections:
         short, whole = self._newest.get(log), self._whole.get(log)
         if short is None or whole is None or log == self._own:
             return whole or (None if log == self._own else short)
-        fresh = whole.version >= short.version or (self._follows_all and whole.anchor == short.anchor)
+        fresh = whole.version >= short.version or (self._follows(log) and whole.anchor == short.anchor)
         return whole if fresh else short
 
     def follow_all(self) -> None:
         """Ask for the knots of all logs from now on: somebody looks at where everybody was."""
         self._follows_all = True
+
+    def _follows(self, log: LogId) -> bool:
+        """Whether it matters where all of another log was: to somebody who looks, or for what is held back."""
+        return self._follows_all or log in self.doubts.rests_on()
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
@@ -195,8 +199,10 @@ class Corrections:
     # Knots
 
     def ask_knots(self, now: float) -> list[Effect]:
-        """Ask for the knots of newer corrections of this robot's log, and of those that somebody looks at."""
-        for log in self._newest if self._follows_all else (self._own,):
+        """Ask for the knots of newer corrections of this robot's log, and of those that it or somebody looks at."""
+        followed = [log for log in self._newest if log == self._own or self._follows(log)]
+        self._requests.keep(followed)
+        for log in followed:
             short = self._newest.get(log)
             if short is not None and not self._has_knots(short) and not self.doubts.knows(short.version):
                 self._requests.want(short.version, self._knots_not_before_s(short, now))
@@ -234,7 +240,7 @@ class Corrections:
             return True
         if message.knots is None or self._has_knots(message) or self.doubts.knows(message.version):
             return False
-        return message.log == self._own or self._follows_all or self._requests.waits(message.log, now)
+        return message.log == self._own or self._follows(message.log) or self._requests.waits(message.log, now)
 
     def claim(self, message: LogCorrection, now: float) -> CorrectionClaim | None:
         """What `refused` would check of a correction that is news; None where it would not come to that."""
@@ -269,7 +275,7 @@ class Corrections:
         if self._has_knots(message):
             return []
         passed_on = self._requests.on_knots(message.version, now)
-        if message.log != self._own and not (passed_on or self._follows_all):
+        if message.log != self._own and not (passed_on or self._follows(message.log)):
             return []
         held = self._whole.get(message.log)
         self._whole[message.log] = message

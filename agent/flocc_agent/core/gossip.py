@@ -185,6 +185,10 @@ class Gossip:
         self._pulls.forget(log)
         remember(self.given_up, log, None)
 
+    def held_otherwise_by(self, peer: str) -> list[LogId]:
+        """Other robots' logs of which a peer was seen to hold another version, which neither of the two takes."""
+        return sorted(log for log, other in self._forked if other == peer and log != self._own)
+
     def silent_s(self, log: LogId, now: float) -> float:
         """For how long nothing new of a log came; counted from the first question where that is not known."""
         return now - self._grown_s.setdefault(log, now)

@@ -5,7 +5,7 @@ way to the leader; what comes is passed on and kept. One log is asked for once a
 circles; a question that nobody answers is asked of another robot after a pause.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass, field
 
 from flocc_agent.core.effects import Effect, Unicast
@@ -72,6 +72,13 @@ class KnotRequests:
             remember(self._open, version.log, _Question(version, not_before_s, own=True, peers=peers))
         else:
             question.own = True
+
+    def keep(self, logs: Container[LogId]) -> None:
+        """This robot itself needs the knots of no other logs than these."""
+        for log, question in list(self._open.items()):
+            question.own &= log in logs
+            if not (question.own or question.peers):
+                del self._open[log]
 
     def on_interest(self, peer: str, version: CorrectionVersion, now: float) -> None:
         """Another robot needs them."""

@@ -154,8 +154,7 @@ class LoopClosing:
             if self._front_ends.are_apart(pair) or not self._prospects.ask(pair):
                 continue
             if self._prospects.was_refused_unseen(pair):
-                self._prospects.on_settled(pair)
-                self._resolved.discard(pair)
+                self._reopen(pair)
             if self._is_due_anyway(pair):
                 self._spared.remove(pair)
             if not self._knows(pair):
@@ -177,6 +176,22 @@ class LoopClosing:
                     self._add(Candidate(pair, 0.0))
             elif self._owner(pair) == self._own and not self._knows(pair):
                 self._assign(Candidate(pair, 0.0), now)
+
+    def settled(self, pairs: Iterable[CandidatePair]) -> list[CandidatePair]:
+        """Those of some pairs of which a record is here."""
+        return [pair for pair in pairs if pair in self._resolved]
+
+    def do_again(self, pair: CandidatePair) -> None:
+        """What is recorded of a pair does not reach whoever waits for it: it is registered once more, and here.
+
+        A stronger robot may hold the same record, and would not begin.
+        """
+        self._reopen(pair)
+        self._add(Candidate(pair, 0.0))
+
+    def _reopen(self, pair: CandidatePair) -> None:
+        self._prospects.on_settled(pair)
+        self._resolved.discard(pair)
 
     def roles(self, pair: CandidatePair) -> tuple[KeyframeId, KeyframeId] | None:
         """Query and match of a pair whose registration is waited for, None if it is not."""

@@ -181,10 +181,21 @@ class Doubts:
             self._refuse(placed.own)
             return why
         if self._held is None:
-            self._held = _HeldBack(placed.own, now, why)
+            self._held = _HeldBack(placed.own, now, why, self._rests_on(placed.own.log))
         elif self._held.correction.version <= placed.own.version:
             self._held = replace(self._held, correction=placed.own, why=why)
         return why
+
+    def rests_on(self) -> frozenset[LogId]:
+        """Other logs on whose poses it rests whether what is held back can be true.
+
+        Where only a log's newest correction is known, its odometry says where it was before; it may have missed a ride.
+        """
+        return frozenset() if self._held is None or self._held.why == UNTIED else self._held.rests_on
+
+    def _rests_on(self, log: LogId) -> frozenset[LogId]:
+        assert self._graph is not None
+        return frozenset(tie.far.log for tie in self._graph.ties(log, TIES_OF_JUMPS_MAX)) - {log}
 
     def speaks_against(self, placed: Placed) -> str | None:
         """What speaks against a correction that this robot made itself, None where nothing does."""
@@ -287,11 +298,12 @@ def _agree(one: LogCorrection, other: LogCorrection, odometry: Float, numbers: N
 
 @dataclass(frozen=True, slots=True)
 class _HeldBack:
-    """What is held back, since when, and why."""
+    """What is held back, since when, and why; and the other logs whose poses may say that it is true."""
 
     correction: LogCorrection
     since_s: float
     why: str
+    rests_on: frozenset[LogId] = frozenset()
     told: bool = False
     solves_s: float | None = None
     """When this robot began to solve the graph itself; long ago where that did not bear it out."""

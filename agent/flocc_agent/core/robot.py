@@ -40,6 +40,7 @@ from flocc_agent.core.events import (
 )
 from flocc_agent.core.gossip import Gossip, Sealer
 from flocc_agent.core.in_map import InMap
+from flocc_agent.core.insisted import Insisted, said_only_in
 from flocc_agent.core.judgement import judged
 from flocc_agent.core.latents import Peer
 from flocc_agent.core.log_copy import BLOCK_RECORDS
@@ -164,6 +165,7 @@ class Robot:
         )
         self._has_keys = sealer is not None
         self._distrust = Distrust()
+        self._insisted = Insisted()
         self.election = LeaderElection(
             log, compute_class, restored.counter_max(), parameters.election, now, compute_classes
         )
@@ -245,6 +247,7 @@ class Robot:
             **self._muted.sizes("muted"),
             **self.assembly.sizes(),
             **self._distrust.sizes(),
+            **self._insisted.sizes(),
             **({} if self.distributed is None else self.distributed.sizes()),
         }
 
@@ -317,8 +320,7 @@ class Robot:
                 answers = self.corrections.on_knot_request(sender.robot, message, now) if near else []
                 return self._answers.within(sender.robot, answers, now)
             case CandidateOffer():
-                self.closing.on_offer(message, now)
-                return []
+                return self._on_offer(sender, message, now)
             case SharedPoses():
                 return self._on_shared_poses(sender, message, now)
 
@@ -439,6 +441,16 @@ class Robot:
             report,
             *self.own_log.reject_lost(self.closing.on_latent_lost(keyframe, now) if lost else [], keyframe, now),
         ]
+
+    def _on_offer(self, sender: LogId, offer: CandidateOffer, now: float) -> list[Effect]:
+        """Take pairs to register, also settled ones whose record its sender will never take."""
+        versions = self.gossip.held_otherwise_by(sender.robot)
+        insisted = self._insisted.among(self.closing.settled(offer.pairs), now) if versions else set()
+        if insisted:
+            for pair in said_only_in(versions, self.log, self.gossip.logs, insisted):
+                self.closing.do_again(pair)
+        self.closing.on_offer(offer, now)
+        return []
 
     def _has(self, keyframe: KeyframeId) -> bool:
         """Whether a keyframe's record is here; of others anybody can speak."""

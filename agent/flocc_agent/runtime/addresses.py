@@ -33,10 +33,10 @@ def at_addresses(settings: dict[str, Any], addresses: Addresses) -> dict[str, An
     interface = settings["scouting/multicast/interface"]
     if is_address(interface):
         return settings
-    here = sorted(address for name, address in addresses if interface in ("auto", name) and ":" not in address)
+    here = sorted(address for name, address in addresses if interface in ("auto", name) and is_ipv4(address))
     if not here:
         return settings
-    everywhere = sorted(address for _, address in addresses if ":" not in address)
+    everywhere = sorted(address for _, address in addresses if is_ipv4(address))
     listened = [each for endpoint in settings["listen/endpoints"] for each in _spelt_out(endpoint, everywhere)]
     return settings | {"scouting/multicast/interface": ",".join(here), "listen/endpoints": listened}
 
@@ -84,6 +84,11 @@ def is_address(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def is_ipv4(address: str) -> bool:
+    """Whether an address is one of IPv4."""
+    return ":" not in address
 
 
 def _counts(address: str) -> bool:

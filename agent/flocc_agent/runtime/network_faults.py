@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from flocc_agent.config import TransportConfig
-from flocc_agent.runtime.addresses import is_address
+from flocc_agent.runtime.addresses import is_address, is_ipv4, machine_addresses
 from flocc_agent.runtime.certificate_faults import certificate_faults
 
 LOOPBACK_S = 5.0
@@ -55,11 +55,24 @@ def interface_faults(config: TransportConfig) -> Iterator[str]:
             yield f"transport.interface: the interface {config.interface!r} is down"
     elif config.multicast and not config.roster and not any(_carries_multicast(flags) for flags in there.values()):
         yield f"no interface for multicast is up (there is {told}); nobody is found until one is"
+    elif config.multicast and not config.roster and not config.multicast_address.startswith("["):
+        yield from _without_ipv4(config, {name for name, flags in there.items() if _carries_multicast(flags)})
     endpoints = (*config.control_listen, *config.bulk_listen)
     named = {found[1]: endpoint for endpoint in endpoints if (found := re.search(r"[#;]iface=([^;#]+)", endpoint))}
     for name, endpoint in named.items():
         if name not in there:
             yield f"{endpoint}: the interface {name!r} does not exist; there is {told}"
+
+
+def _without_ipv4(config: TransportConfig, up: set[str]) -> Iterator[str]:
+    """Interfaces that are up with addresses of IPv6 alone, such as those of a link: nobody can join a group of IPv4."""
+    here = machine_addresses()
+    if not any(name in up and is_ipv4(address) for name, address in here):
+        group = config.multicast_address.rpartition(":")[0]
+        yield (
+            f"no interface has an IPv4 address (up: {', '.join(sorted(up))}), and the group {group} is one of IPv4; "
+            f"nobody is found until one has, 169.254.X.Y of its link or another"
+        )
 
 
 def host_faults(config: TransportConfig, robot: str) -> Iterator[str]:

@@ -49,9 +49,13 @@ def unregistered(swarm: Swarm) -> Iterator[str]:
 
 
 def in_other_frames(swarm: Swarm) -> Iterator[str]:
-    """One frame: robots whose map frame is not that of their part of the pose graph."""
+    """One frame: robots whose map frame is not that of their part of the pose graph, as their leader holds it.
+
+    Where a rolled-back disk made two versions of a log, others may hold the one without the closures that join parts.
+    """
     for group in groups(swarm):
-        graph = core(group[0]).assembly.graph()
+        leader = next((station for station in group if core(station).election.leading), group[0])
+        graph = core(leader).assembly.graph()
         parts = components_of(list(graph.trajectories), graph.closures)
         frames = {log: map_frame(logs[0]) for logs in parts for log in logs}
         for station in group:

@@ -30,7 +30,7 @@ from flocc_agent.core.offers import FAR_TAKEOVERS, TAKEOVER_S
 from flocc_agent.core.plausibility import UNTIED
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.prospects import UNLIKELY
-from flocc_agent.core.reports import NeighbourDown, NeighbourUp, PeerRefused
+from flocc_agent.core.reports import LogForked, NeighbourDown, NeighbourUp, PeerRefused
 from flocc_launch.simulation import agreed, liveness
 from flocc_launch.simulation.completeness import Complete
 from flocc_launch.simulation.costs import Balanced, Cheap
@@ -202,6 +202,7 @@ class Once:
     _begun: dict[CandidatePair, list[_Registered]] = field(default_factory=lambda: defaultdict(list))
     _records: dict[CandidatePair, set[tuple[LogId, int, bytes]]] = field(default_factory=lambda: defaultdict(set))
     _heard: dict[tuple[str, str], tuple[bool, float]] = field(default_factory=dict)
+    _forked: set[LogId] = field(default_factory=set)
 
     def step(self, step: Step) -> Iterator[str]:
         """A second registration of a pair without an excuse."""
@@ -211,6 +212,8 @@ class Once:
                     self._note_record(log, number, data)
                 case Report(NeighbourUp() | NeighbourDown() as changed):
                     self._heard[step.station.name, changed.peer] = isinstance(changed, NeighbourUp), step.at_s
+                case Report(LogForked(log=log)):
+                    self._forked.add(log)
                 case Register(pair):
                     yield from self._registers(step, pair)
 
@@ -227,6 +230,7 @@ class Once:
         if any(
             log in logs and logs[log].encoded[number : number + 1] == [data] and withdrawals.counts(log, number, pair)
             for log, number, data in self._records[pair]
+            if log not in self._forked
         ):
             yield f"{name}, of which it holds a record"
         earlier = self._begun[pair]

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from flocc_agent.core import plausibility
+from flocc_agent.core.closure_rows import Tie
 from flocc_agent.core.correction_evidence import HeldGraph, Placed
 from flocc_agent.core.knots import Track, knots_of
 from flocc_agent.core.plausibility import AGREE_M, BENT, HELD_BACK_S, SOLVED_S, SOLVES_EVERY_S, Doubts
 from flocc_agent.core.pose_graph import Component
-from flocc_protocol.ids import LogId, Term
+from flocc_protocol.ids import KeyframeId, LogId, Term
 from flocc_protocol.messages import LogCorrection
 
 OWN, LEADER = LogId("r2"), LogId("r1")
@@ -21,6 +22,9 @@ T_ODOM[:, 0, 3] = np.arange(20)
 class _Graph:
     def odometry(self, log: LogId) -> np.ndarray:
         return T_ODOM
+
+    def ties(self, log: LogId, ties_max: int) -> list[Tie]:
+        return [Tie(3, KeyframeId(LEADER, 4), 1.0), Tie(9, KeyframeId(OWN, 2), 1.0)]
 
 
 def believed(monkeypatch: pytest.MonkeyPatch, *solved: np.ndarray) -> list[int]:
@@ -69,6 +73,7 @@ def doubting(monkeypatch: pytest.MonkeyPatch) -> Doubts:
     assert doubts.believes(Placed(told(moved(50.0), 1), {}), 0.0) == BENT
     assert doubts.given_up(HELD_BACK_S) is None
     assert doubts.wants_solution
+    assert doubts.rests_on() == {LEADER}
     return doubts
 
 

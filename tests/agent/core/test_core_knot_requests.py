@@ -3,7 +3,7 @@
 from flocc_agent.core.effects import Unicast
 from flocc_agent.core.knot_requests import ASKED_MAX, INTEREST_S, RARELY_S, KnotRequests
 from flocc_protocol.ids import LogId, Term
-from flocc_protocol.messages import CorrectionVersion
+from flocc_protocol.messages import CorrectionVersion, KnotRequest
 
 VERSION = CorrectionVersion(LogId("r1"), Term(1, LogId("r4")), 10)
 
@@ -39,3 +39,13 @@ def test_who_asked_long_ago_may_have_them_by_now() -> None:
     requests.on_interest("r2", VERSION, 0.0)
     requests.on_interest("r3", VERSION._replace(term=Term(4, LogId("r2"))), 1.0)
     assert asked_at_s(requests, int(INTEREST_S) + 3)[0] == INTEREST_S
+
+
+def test_who_needs_the_knots_of_a_log_no_more_asks_on_for_others_only() -> None:
+    requests = KnotRequests(lambda _: ["r9"])
+    versions = [VERSION._replace(log=LogId(name)) for name in ("r1", "r2", "r3")]
+    for version in versions:
+        requests.want(version, 0.0)
+    requests.on_interest("r5", versions[1], 0.0)
+    requests.keep([LogId("r1")])
+    assert requests.ask(0.0) == [Unicast("r9", KnotRequest((versions[0], versions[1])))]
