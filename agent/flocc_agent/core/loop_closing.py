@@ -187,6 +187,7 @@ class LoopClosing:
         A stronger robot may hold the same record, and would not begin.
         """
         self._reopen(pair)
+        self._spared.need(pair)
         self._add(Candidate(pair, 0.0))
 
     def _reopen(self, pair: CandidatePair) -> None:

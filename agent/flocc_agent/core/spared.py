@@ -124,13 +124,15 @@ class Spared:
         self._similarities: PairTable[float] = PairTable(SPARED_MAX)
         self._weak: dict[CandidatePair, tuple[int, int]] = {}
         """What was known of pairs that were not told."""
+        self._needed: dict[CandidatePair, None] = {}
 
     def __contains__(self, pair: CandidatePair) -> bool:
         return pair in self._similarities
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
-        return {"spared": self._similarities.size(), "weak": (len(self._weak), LOOKED_MAX)}
+        looked = {"weak": (len(self._weak), LOOKED_MAX), "needed": (len(self._needed), LOOKED_MAX)}
+        return {"spared": self._similarities.size(), **looked}
 
     def is_any(self) -> bool:
         """Whether pairs are spared at all, with the closures that are known."""
@@ -138,7 +140,7 @@ class Spared:
 
     def is_told(self, pair: CandidatePair) -> bool:
         """Whether closures beside a pair tell what it would."""
-        if not self.is_any():
+        if not self.is_any() or pair in self._needed:
             return False
         if min(self._held.density(pair.low, STRETCH), self._held.density(pair.high, STRETCH)) < TIED_MIN:
             return False
@@ -153,6 +155,10 @@ class Spared:
         if foretold.is_whole:
             remember(self._weak, pair, marks, LOOKED_MAX)
         return False
+
+    def need(self, pair: CandidatePair) -> None:
+        """Somebody waits for a pair whose records do not reach it: whatever is known here does not tell it."""
+        remember(self._needed, pair, None, LOOKED_MAX)
 
     def add(self, pair: CandidatePair, similarity: float) -> None:
         """A pair is not to be registered for now."""

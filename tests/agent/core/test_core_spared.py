@@ -466,3 +466,11 @@ def test_a_pair_is_looked_at_again_when_keyframes_of_closures_become_known() -> 
     for log in others:
         road.drives(log, 12)
     assert road.spared.is_told(pair(12, 12))
+
+
+def test_a_pair_whose_record_does_not_reach_who_waits_for_it_is_registered_again_whatever_others_tell() -> None:
+    road = Road()
+    closing, candidate = machine(road), of_r1()[0]
+    learns(closing, road, [*TELLING, (candidate.low.index, candidate.high.index)])
+    closing.do_again(candidate)
+    assert registered(closing.tick(0.0)) == [candidate]
