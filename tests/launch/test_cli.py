@@ -1,5 +1,6 @@
 """The command line: bad input gives one clear sentence and exit code 2, and nothing recorded is lost."""
 
+import logging
 import socket
 import sys
 from pathlib import Path
@@ -36,6 +37,24 @@ def scenario(folder: Path, text: str) -> str:
     path = folder / "scenario.toml"
     path.write_text(text, encoding="utf-8")
     return str(path)
+
+
+def test_what_a_recording_has_to_say_is_said_once_in_a_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A command reads a recording for its robots, for the truth and for the report."""
+
+    def read_thrice() -> None:
+        for name in ("odometry", "odometry", "images", "odometry"):
+            logging.getLogger("flocc").warning("%s: says nothing from %.1f s to %.1f s", name, 1.0, 9.0)
+        sys.exit(0)
+
+    monkeypatch.setattr(logging.root, "handlers", [])
+    monkeypatch.setattr("flocc_launch.commands.main.app", lambda *_, **__: read_thrice())
+    assert run(monkeypatch, "simulate") == 0
+    assert run(monkeypatch, "simulate") == 0, "the next command says it again"
+    said = [f"{name}: says nothing from 1.0 s to 9.0 s" for name in ("odometry", "images")]
+    assert capsys.readouterr().err.splitlines() == said * 2
 
 
 BAD_SCENARIOS = [

@@ -88,3 +88,13 @@ def test_pairs_turn_enough_to_be_seen_and_not_too_much() -> None:
     still = Trajectory(stamps_s, np.tile(np.eye(4), (200, 1, 1)))
     assert chosen_pairs(images, still) == []
     assert 0.01 * APART_MAX > TURN_MAX_RAD
+
+
+@pytest.mark.data
+@needs_street
+@pytest.mark.parametrize(("later_s", "told"), [(0.0, None), (0.5, "turns about 0.5 s later than the pictures do")])
+def test_a_trajectory_of_another_clock_is_told(later_s: float, told: str | None) -> None:
+    source = read_source(STREET)
+    assert source.odometry is not None
+    faults = seen_faults(source, source.odometry.later(later_s))
+    assert (len(faults) == 0) if told is None else (told in faults[0] and "flocc dataset clock" in faults[0])

@@ -22,7 +22,7 @@ dual variable biases. What is different is the penalty, and with it the form of 
 
 Unknown scales: a scale of its own is eliminated before anything else sees it (`edges`); those of clusters belong to
 one pair, and so are the owner's alone. Weights of closures are the owner's as well, and constants here: decided while
-robots still move, they let go of all closures, because the forces that answered them stay (docs/back-end.md).
+robots still move, they let go of all closures, because the forces that answered them stay (docs/distributed-mode.md).
 """
 
 from collections.abc import Mapping, Sequence

@@ -15,6 +15,7 @@ import numpy as np
 from flocc_agent.backend.alarms import fitted_lengths, held_closures
 from flocc_agent.backend.chains import Chains, chains_of, is_explained
 from flocc_agent.backend.filtering import Filtered, filtered
+from flocc_agent.backend.hanging import HANG, hanging_parts
 from flocc_agent.backend.initial import Aligned, component_with, initial_poses, lengths_at
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.mapped import solver_keyframes, with_map, without_map
@@ -69,7 +70,11 @@ def optimise(
         return _optimise_in_map(graph, graph.saved, config, initial, covariance_of)
     expanded = with_factors(graph, config, initial)
     solution = _optimise(expanded.graph, config, expanded.initial, covariance_of)
-    return solution if isinstance(solution, OptimisationFailed) else without_factors(solution, graph, expanded)
+    if isinstance(solution, OptimisationFailed):
+        return solution
+    lasting = (warning for warning in solution.warnings if HANG not in warning)
+    solution = replace(solution, warnings=(*lasting, *hanging_parts(expanded.graph, solution)))
+    return without_factors(solution, graph, expanded)
 
 
 def _optimise_in_map(

@@ -14,6 +14,7 @@ from flocc_agent.backend.scale_report import odometry_warnings, scale_warnings
 from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN
 from flocc_agent.backend.ties import tie_warnings
 from flocc_agent.backend.trueness import inflations, told
+from flocc_agent.backend.wrong_steps import wrong_step_warnings
 from flocc_agent.config import Solver
 from flocc_agent.core.pose_graph import ClosureResult, ClosureState, Component, LoopClosure, OdometryScale, Trajectory
 from flocc_agent.geometry import Float, inverse
@@ -76,7 +77,9 @@ def collect(solution: Solution, wanted: Sequence[KeyframeId]) -> SolvedLogs:
     results = closure_results(solution)
     component = _component(solution, wanted)
     warnings = scale_warnings(solution.problem, solution.solved, solution.recorded)
-    warnings = (*warnings, *odometry_warnings(solution.odometry_scales), *_ties(solution, results))
+    scaled = odometry_warnings(solution.odometry_scales)
+    steps = wrong_step_warnings(solution.problem, solution.solved) if scaled and solution.chains is None else ()
+    warnings = (*warnings, *scaled, *steps, *_ties(solution, results))
     if not solution.solved.converged:
         warnings = (*warnings, f"{component.map_frame}: the solver stopped before it converged")
     return SolvedLogs((component,), results, warnings, solution.solved.iterations)

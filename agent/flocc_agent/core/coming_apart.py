@@ -15,7 +15,8 @@ from flocc_protocol.ids import LogId
 CONTACTS = 5
 """So many in a row beyond what is allowed, of which the last is not clearly smaller than the first.
 
-Good teams had at most 3 in a row, shrinking; broken ones (`ANCHORING_FLOATING` of 1e-3) 16 to 33 (docs/back-end.md)."""
+Good teams had at most 3 in a row, shrinking; broken ones (`ANCHORING_FLOATING` of 1e-3) 16 to 33
+(docs/distributed-mode.md)."""
 SHRUNK_RATIO = 0.5
 NEAR_M, DRIFTED_RATIO = 2.0, 0.1
 """How far two robots may be apart, and against both ways: several times what odometry drifts. Good teams were at most

@@ -127,8 +127,12 @@ def is_unmeasured(record: OdometryCovarianceRecord) -> bool:
 
     A robot that drives in a plane may well know nothing of two of them.
     """
-    rotation = symmetric(record.covariance.numpy())[:3, :3]
-    return float(np.linalg.eigvalsh(rotation)[0]) > UNMEASURED_RAD**2
+    return bool(nobody_measured(symmetric(record.covariance.numpy())))
+
+
+def nobody_measured(covariances: Float) -> NDArray[np.bool_]:
+    """The same of steps with covariances (..., 6, 6)."""
+    return np.asarray(np.linalg.eigvalsh(covariances[..., :3, :3])[..., 0] > UNMEASURED_RAD**2)
 
 
 def _robots_of(log: LogId, record: Record) -> set[str]:

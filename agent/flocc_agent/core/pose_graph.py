@@ -7,6 +7,7 @@ one `map` frame that is named after the component's anchor, its lowest log.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -295,11 +296,14 @@ def components_of(logs: Sequence[LogId], closures: Sequence[LoopClosure]) -> tup
     return groups_of(logs, [(closure.query.log, closure.match.log) for closure in closures])
 
 
-def groups_of(logs: Sequence[LogId], links: Sequence[tuple[LogId, LogId]]) -> tuple[tuple[LogId, ...], ...]:
-    """Group logs that links connect; each group sorted, groups sorted by their lowest log."""
+Node = TypeVar("Node", LogId, KeyframeId)
+
+
+def groups_of(logs: Sequence[Node], links: Sequence[tuple[Node, Node]]) -> tuple[tuple[Node, ...], ...]:
+    """Group logs, or parts of them, that links connect; each group sorted, groups sorted by their lowest one."""
     parent = {log: log for log in logs}
 
-    def root(log: LogId) -> LogId:
+    def root(log: Node) -> Node:
         while parent[log] != log:
             parent[log] = parent[parent[log]]
             log = parent[log]
@@ -309,7 +313,7 @@ def groups_of(logs: Sequence[LogId], links: Sequence[tuple[LogId, LogId]]) -> tu
         if a in parent and b in parent:
             low, high = sorted((root(a), root(b)))
             parent[high] = low
-    groups: dict[LogId, list[LogId]] = {}
+    groups: dict[Node, list[Node]] = {}
     for log in sorted(logs):
         groups.setdefault(root(log), []).append(log)
     return tuple(tuple(groups[anchor]) for anchor in sorted(groups))

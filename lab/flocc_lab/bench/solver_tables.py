@@ -1,4 +1,4 @@
-"""Tables of the back end for docs/back-end.md: outliers, growth with the number of closures, the scale task's time.
+"""Tables for docs/back-end-figures.md: outliers, growth with the number of closures, the scale task's time.
 
 `python -m flocc_lab.bench.solver_tables outliers|growth|scale|lm [FILE]` prints one as Markdown.
 """

@@ -1,6 +1,7 @@
 """What commands share: endings, progress, and how a scenario's report is shown."""
 
 import json
+import logging
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +21,34 @@ EXIT_TRY_AGAIN = 75
 EXIT_READER_LEFT = 141
 """As any program ends that writes into a pipe whose reader has left (`| head`): 128 + SIGPIPE."""
 """An agent's disk or machine was at its end: systemd starts it again, which it does not after bad input."""
+
+
+WARNINGS_REMEMBERED = 1000
+
+
+class SaidOnce(logging.Filter):
+    """Lets a sentence through once: a command reads one recording several times, and it has the same to say."""
+
+    def __init__(self) -> None:
+        """Remember nothing yet."""
+        super().__init__()
+        self._said: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether it was not said before."""
+        text = record.getMessage()
+        if text in self._said:
+            return False
+        if len(self._said) < WARNINGS_REMEMBERED:
+            self._said.add(text)
+        return True
+
+
+def say_warnings_once() -> None:
+    """Where a command's warnings go to the terminal, each does once; agents' own logs have all."""
+    handler = logging.lastResort
+    if handler is not None:
+        handler.filters = [*(each for each in handler.filters if not isinstance(each, SaidOnce)), SaidOnce()]
 
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts; all else goes to stderr.")]

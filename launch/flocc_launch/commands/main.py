@@ -17,6 +17,7 @@ from flocc_launch.commands.common import (
     Speech,
     Verbose,
     progress_bar,
+    say_warnings_once,
     show_report,
 )
 from flocc_launch.commands.data import add_data
@@ -82,6 +83,7 @@ Set = Annotated[list[str] | None, typer.Option("--set", help="Another value for 
 def main() -> None:
     """Entry point: one clear sentence and exit code 2 for bad input, a traceback only for a bug."""
     speak_utf8()
+    say_warnings_once()
     try:
         app(with_ros_args(sys.argv[1:]), prog_name="flocc")
     except SystemExit:

@@ -29,6 +29,7 @@ from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.unread import unused
 from flocc_launch.datasets.video import (
     WHAT_ODOMETRY,
+    beside_notes,
     convert_video,
     is_video,
     lens_beside,
@@ -259,6 +260,7 @@ def _video_info(path: Path) -> Info:
         truth_poses=None,
         length_m=None if trajectory is None else trajectory.length_m(),
         faults=tuple(lacks),
+        notes=tuple(beside_notes(path)),
     )
 
 
@@ -292,7 +294,7 @@ def clock(path: Path, odometry: Path | None = None, camera: Path | None = None, 
     Raises:
         DatasetError: There is no trajectory or calibration, or the pictures do not tell.
     """
-    source = read_source(path, None, camera, form if odometry is None else None, time_offset_s=None)
+    source = read_source(path, None, camera, form if odometry is None else None, None, odometry)
     trajectory = source.odometry or source.truth if odometry is None else read_trajectory(odometry, form)[0]
     if trajectory is None:
         raise DatasetError(f"{path}: has neither odometry nor ground truth ({expected_files(path)})")
@@ -380,7 +382,7 @@ def convert(
             logger.warning("%s", note)
         return out
     own_form = form if odometry is None else None
-    source = _viewed(read_source(path, format_name, camera, own_form, time_offset_s), view_deg)
+    source = _viewed(read_source(path, format_name, camera, own_form, time_offset_s, odometry), view_deg)
     _tell(source, camera, odometry)
     identity = _identity(
         f"convert time_offset_s={time_offset_s}" if time_offset_s else "convert", path, source, drift, seed

@@ -51,11 +51,13 @@ REASONS_LEFT = (
 
 
 SOLVER_ADVICE = {
+    "not along the way": "Look at odometry there first: wheels that slipped, a push, a robot that was blocked.",
     "measures lengths": "Calibrate what it takes lengths from: wheel radius, stereo baseline, camera height.",
     SECOND_PLACE: ADVICE,
     "held until another one agrees": "If it is right, pass the place again; if not, nothing is to be done.",
     "sightings that agree": "One alone may be wrong: see it a second time, or set backend.closures_to_join_min = 1.",
     "agree with the rest of the map": "docs/measurements.md says how each kind is written.",
+    "nothing measured ties": "Do not believe where that part is: pass a place that was seen before, or a tag.",
     "look the same": "Look at the pictures of both places in the report; a fix, a tag or a known start decides.",
     "the distance between robots": "Let them meet side by side as well as ahead, or measure a length: fix, tag, range.",
 }
