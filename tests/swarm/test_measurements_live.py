@@ -87,7 +87,7 @@ def error_m(agents: list[Agent]) -> float:
 
 
 def sees_the_tag(robot: int, k: int) -> Measurement | None:
-    if k not in (3 - robot, 4 - robot):
+    if k != 4 - robot:
         return None
     return TagSighting("7", inverse(T_world_body(robot, k)) @ T_WORLD_TAG, TIGHT)
 

@@ -57,7 +57,7 @@ class Filtered:
     def without(self, turned_away: Mapping[int, ClosureResult]) -> "Filtered":
         """The same without these closures, and without those that are then too few to join maps."""
         fewer = replace(self, turned_away={**self.turned_away, **turned_away})
-        left, reason = fewer.left, f"fewer than {self.closures_min} closures or sightings that agree join these maps"
+        left, reason = fewer.left, f"fewer than {self.closures_min} closures join these maps"
         lonely = {k: rejected(left[k], reason) for k in too_few(list(self.trajectories), left, self.closures_min)}
         return replace(fewer, turned_away={**fewer.turned_away, **lonely})
 

@@ -4,8 +4,9 @@ A single closure between two maps contradicts nothing, so no robust solver can t
 join them. Maps are joined where, however they are divided into two sides, at least `closures_to_join_min` closures that
 agree with each other connect the sides: several between two robots, or one on each side of a ring of robots.
 
-A single sighting of a tag or of a robot, or a single pose in the world, contradicts nothing either. A landmark is no
-map: it goes with who saw it most often, whatever that is, and joins whoever else saw it often enough.
+A single sighting of a tag or of a robot, or a single pose in the world, contradicts nothing either. It counts as many
+closures, since whoever measures it knows more than two pictures that look alike do; what rests on one of them is told.
+A landmark is no map: it goes with who saw it most often, whatever that is.
 """
 
 from collections.abc import Mapping, Sequence

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.alignment import evenly
+from flocc_agent.backend.joining import too_few
 from flocc_agent.backend.misread import misread
 from flocc_agent.backend.problem import diagonal_covariance
 from flocc_agent.backend.screening import first_not_rigid, is_covariance
@@ -49,7 +50,8 @@ Int = NDArray[np.int64]
 CERTAIN_RATIO = 1e6
 """Match ratio of what was measured: Eq. (2) gives it the probability 1."""
 JOINS = 1000
-"""Support of what nothing else needs to agree with to join maps: several positions together, and a known start."""
+"""Support of what fixes all six degrees of freedom: one joins maps."""
+NOTHING_CONFIRMS = "and nothing else confirms it yet: if it is wrong, so is the whole map"
 ROTATION_OPEN_SIGMA_RAD = 10.0
 POSITIONS_MIN = 3
 SPREAD_SIGMAS = 3.0
@@ -70,6 +72,7 @@ class Expanded:
         places: Of each closure beyond the graph's own, its factor's place in `PoseGraph.measured`.
         left_out: Reason for each factor that is no closure.
         notes: Sentences for people.
+        joins_min: How many closures join two maps.
     """
 
     graph: PoseGraph
@@ -77,6 +80,7 @@ class Expanded:
     places: tuple[int, ...] = ()
     left_out: Mapping[int, str] = ()  # type: ignore[assignment]
     notes: tuple[str, ...] = ()
+    joins_min: int = 1
 
 
 def with_factors(graph: PoseGraph, config: BackendConfig, initial: GraphSolution | None) -> Expanded:
@@ -107,7 +111,7 @@ def with_factors(graph: PoseGraph, config: BackendConfig, initial: GraphSolution
         graph, trajectories=trajectories, closures=(*graph.closures, *(closures[k] for k in places)), measured=()
     )
     started = None if initial is None else _with_landmarks(initial, [closures[k] for k in places])
-    return Expanded(expanded, started, places, left_out, tuple(notes))
+    return Expanded(expanded, started, places, left_out, tuple(notes), config.closures_to_join_min)
 
 
 def without_factors(solution: GraphSolution, graph: PoseGraph, expanded: Expanded) -> GraphSolution:
@@ -134,6 +138,7 @@ def without_factors(solution: GraphSolution, graph: PoseGraph, expanded: Expande
         warnings=(
             *(warning for warning in solution.warnings if LANDMARK not in warning),
             *expanded.notes,
+            *_unconfirmed(solution, graph, expanded),
             *dict.fromkeys(of_many.values()),
             *(
                 f"{r.factor} is not used: {r.reason}"
@@ -185,10 +190,23 @@ def _from_origin(factor: MeasuredFactor, origin: Place | None) -> MeasuredFactor
     return replace(factor, T_query_match=pose(np.eye(3), T[:3, 3]), covariance=R @ factor.covariance @ R.T)
 
 
+def _unconfirmed(solution: GraphSolution, graph: PoseGraph, expanded: Expanded) -> list[str]:
+    """One sentence for each sighting, pose or registration on which alone a join of maps rests: it may be wrong."""
+    results = zip(expanded.graph.closures, solution.closures, strict=True)
+    used = {k: closure for k, (closure, result) in enumerate(results) if result.state is ClosureState.USED}
+    factors = {len(graph.closures) + n: graph.measured[k] for n, k in enumerate(expanded.places)}
+    once = {k for k in used if k in factors and factors[k].has_rotation and not _is_start(factors[k])}
+    counted = {k: replace(closure, support=1) if k in once else closure for k, closure in used.items()}
+    alone = too_few(list(expanded.graph.trajectories), counted, expanded.joins_min)
+    return [f"{factors[k]} alone joins two maps, {NOTHING_CONFIRMS}" for k in alone if k in once]
+
+
+def _is_start(factor: MeasuredFactor) -> bool:
+    return factor.kind == PoseFix.kind and factor.at.index == 0
+
+
 def _whole(factor: MeasuredFactor) -> LoopClosure:
-    """A whole pose: a sighting may be wrong as a registration may; a start is known, and there is but one."""
-    is_start = factor.kind == PoseFix.kind and factor.at.index == 0
-    return _closure(factor, factor.T_query_match, factor.covariance, JOINS if is_start else 1)
+    return _closure(factor, factor.T_query_match, factor.covariance, JOINS)
 
 
 def _closure(factor: MeasuredFactor, T: Float, covariance: Float, support: int) -> LoopClosure:
