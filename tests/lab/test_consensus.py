@@ -88,6 +88,28 @@ def test_scales_of_clusters_are_the_owners_and_give_the_same_map() -> None:
     assert (ate_m({log: T[:, :3, 3] for log, T in team.T.items()}, reference) or 0.0) < 0.02
 
 
+@pytest.mark.parametrize("lower_is_heard", [True, False])
+def test_where_every_contact_breaks_off_after_its_first_message_robots_come_to_rest_no_worse_than_alone(
+    lower_is_heard: bool,
+) -> None:
+    drawn = three_robots()
+    parts = Sweeps(drawn.graph, config()).parts
+    ways = [{log: part.T for log, part in parts.items()}]
+    for number in range(1, 41):
+        for log, part in parts.items():
+            part.step(number)
+            for other in part.neighbours:
+                if (log < other) == lower_is_heard:
+                    count = len(part.neighbours[other].index)
+                    parts[other].hear(log, Tidings.of(part.tell(other).told(), count))
+        ways.append({log: part.T for log, part in parts.items()})
+    for log in parts:
+        assert np.abs(ways[-1][log] - ways[-10][log]).max() < 1e-4
+        alone_m, agreed_m = (ate_m({log: way[log][:, :3, 3]}, drawn.truth_m()) or 0.0 for way in (ways[0], ways[-1]))
+        assert agreed_m < 1.05 * alone_m
+    assert any(np.abs(ways[-1][log] - ways[0][log]).max() > 0.01 for log in parts)
+
+
 def test_at_rest_forces_are_opposite_and_poses_agree() -> None:
     graph = three_robots().graph
     team = swept(graph, config(), 60)
@@ -117,7 +139,7 @@ def test_a_robot_without_neighbours_is_solved_alone() -> None:
     graph = three_robots().graph
     alone = PoseGraph({A: graph.trajectories[A]}, [c for c in graph.closures if c.query.log == c.match.log == A])
     T = np.asarray(graph.trajectories[A].T_odom_keyframe, dtype=float)
-    part = part_of_graph(alone, A, config(), T)
+    part = part_of_graph(alone, A, config(), T, {})
     assert part.neighbours == {}
     assert np.allclose(solved_alone(part), T, atol=1e-6)
 

@@ -181,6 +181,14 @@ REFUSED = {
         "width: 160\nheight: 120\nfx: 1\nfy: 1\ncx: 1\ncy: 1\nradial_distortion: [0.1, 0.2]\n",
         "the key 'radial_distortion' is not understood and may be about the camera",
     ),
+    "where a URDF puts it": (
+        'width: 160\nheight: 120\nfx: 1\nfy: 1\ncx: 1\ncy: 1\norigin: {xyz: "0.1 0 0.3", rpy: "0 0 0"}\n',
+        "the key 'origin' is not understood and may be about the camera",
+    ),
+    "pixels that are no squares": (
+        "width: 160\nheight: 120\nfx: 1\nfy: 1\ncx: 1\ncy: 1\npixel_aspect_ratio: 1.2\n",
+        "the key 'pixel_aspect_ratio' is not understood and may be about the camera",
+    ),
     "skew": (f"width: 160\nheight: 120\nK: {[150, 3, *K[2:]]}\n", "has a skew of 3"),
     "a scaled mounting": (
         f"width: 160\nheight: 120\nfx: 1\nfy: 1\ncx: 1\ncy: 1\nT_BS: {[2 * value for value in T]}\n",

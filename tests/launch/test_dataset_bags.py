@@ -349,6 +349,22 @@ def test_odometry_whose_stamp_stands_still_is_refused(tmp_path: Path) -> None:
         convert(script.write(bag_path(tmp_path, "bag")), tmp_path / "out")
 
 
+def test_images_in_gaps_of_odometry_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    script = walking(True, odometry=None)
+    for stamp_s, x in ((0.0, 0.0), (1.0, 1.0), (20.0, 20.0)):
+        script.odometry("/odom", ZERO_NS + round(stamp_s * 1e9), x)
+    convert(script.write(bag_path(tmp_path, "bag")), tmp_path / "out")
+    assert "4 of 5 images lie outside of the time of odometry (/odom), or in a gap of it: no robot uses" in caplog.text
+
+
+def test_two_programs_on_one_topic_of_odometry_are_refused(tmp_path: Path) -> None:
+    script = walking(True, odometry=None)
+    for k in range(60):
+        script.odometry("/odom", ZERO_NS + k * 10**8, 0.1 * k + (80.0 if k // 4 % 2 else 0.0))
+    with pytest.raises(DatasetError, match=r"odometry begins anew 14 times in 60 messages, as where two programs"):
+        convert(script.write(bag_path(tmp_path, "bag")), tmp_path / "out")
+
+
 def test_too_many_damaged_messages_are_refused(tmp_path: Path) -> None:
     script = walking(False)
     for k in range(3):

@@ -667,6 +667,9 @@ def test_stamps_of_frames_are_taken(tmp_path: Path, unit: float, read: bool) -> 
     [
         ({"applied_scale": 0.1}, ""),
         ({"applied_scale": 0.0}, "applied_scale must be a number above 0"),
+        ({"applied_scale": 0.1, "camera_convention": "OpenGL", "orientation_override": "up"}, ""),
+        ({"camera_convention": "opencv"}, "camera_convention is 'opencv', but poses are read as those of a camera"),
+        ({"w2c": True}, "w2c is 'True', but poses are read as those of a camera in the world"),
         ({"applied_transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}, "applied_transform is not rigid"),
     ],
 )

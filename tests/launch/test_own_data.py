@@ -320,7 +320,9 @@ def test_info_counts_the_images_that_have_a_pose(own: Path) -> None:
 
 def test_no_trajectory_is_said_with_the_names_that_it_could_have(own: Path, tmp_path: Path) -> None:
     (own / "groundtruth.txt").rename(own / "KeyFrameTrajectory.txt")
-    with pytest.raises(DatasetError, match=r"neither odometry nor ground truth \(odometry, trajectory, .* looked for"):
+    with pytest.raises(
+        DatasetError, match=r"neither odometry nor ground truth \(odometry, odom, vio, trajectory, .* looked for"
+    ):
         convert(own, tmp_path / "out")
 
 

@@ -48,6 +48,24 @@ def test_frames_get_the_stamps_of_the_video(video: Path, tmp_path: Path) -> None
     assert recording.load_image(recording.frames[20]).pixels.mean() == pytest.approx(160, abs=6)
 
 
+def test_what_lies_beside_a_video_under_its_name_is_told(
+    video: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    beside(video)
+    (video.parent / "walk_timestamps.csv").write_text("0,0.0\n")
+    (video.parent / "walker.txt").write_text("of another\n")
+    write_tum(video.parent / "odometry.tum", Trajectory(np.arange(40.0), np.tile(np.eye(4), (40, 1, 1))))
+    convert(video, tmp_path / "out")
+    told = "walk.mp4: not used: odometry.tum, walk_timestamps.csv"
+    assert caplog.text.strip().endswith(told)
+    assert [note.partition(str(video.parent) + "/")[2] for note in info(video).notes] == [told]
+    (video.parent / "walk.csv").write_text(
+        "time[s],x,y,z,qx,qy,qz,qw\n" + "".join(f"{k},{k},{k},0,0,0,0,1\n" for k in range(9))
+    )
+    with pytest.raises(DatasetError, match=r"walk.tum and walk.csv tell different motions"):
+        convert(video, tmp_path / "out2")
+
+
 def test_a_video_without_odometry_says_what_is_needed(video: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"walk.mp4: a video has no odometry: give the camera's metric trajectory"):
         convert(video, tmp_path / "out")

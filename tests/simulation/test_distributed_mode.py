@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flocc_agent.backend import consensus
 from flocc_agent.backend.consensus_pair import PairedRobot, Tidings
 from flocc_agent.config import BackendConfig, BackendMode, Formulation
 from flocc_launch.doctor import diagnose
@@ -83,7 +82,6 @@ def test_robots_whose_penalties_differ_come_apart_and_notice_it_and_none_correct
     differ: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Robots that nothing else holds are nearly free here, so that there is far to go; still they agree, else not."""
-    monkeypatch.setattr(consensus, "ANCHORING_FLOATING", 1e-3)
     if differ:
         monkeypatch.setattr(PairedRobot, "hear", heard_by_the_penalty_of_before)
     simulate(scenario(**CROWD), tmp_path / "run", 1)

@@ -35,11 +35,11 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from flocc_agent.backend.consensus_pair import PairedRobot, Tidings, number_of
 from flocc_agent.backend.descent import LENGTHS
-from flocc_agent.backend.edges import Edges, Residuals, State, jacobians, residuals, state_of
-from flocc_agent.backend.problem import closure_edges, concatenate, odometry_edges
+from flocc_agent.backend.edges import NEAR_M, TINY, Edges, Residuals, State, jacobians, residuals, state_of
+from flocc_agent.backend.problem import closure_edges, concatenate, initial_scale, odometry_edges
 from flocc_agent.backend.shared_stiffness import SharedStiffness, rows_of, stiffness_of
 from flocc_agent.config import BackendConfig
-from flocc_agent.core.own_part import Apart
+from flocc_agent.core.own_part import Apart, OwnedClosure
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_agent.geometry import inverse
 from flocc_protocol.ids import KeyframeId, LogId
@@ -47,9 +47,9 @@ from flocc_protocol.ids import KeyframeId, LogId
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-ANCHORING_FLOATING = 0.03
-"""Part of the closures' information that holds a robot which nothing else holds, where its stiffness is asked for. With
-1e-3 five robots on a mission threw each other kilometres away; with 0.1 CSAIL takes twice as long."""
+ANCHORING_FLOATING = 1e-3
+"""Part of the closures' information that holds a robot which nothing else holds, where its stiffness is asked for. At
+each pose, so that a hundred of them hold a long chain a hundred times: with 0.03 chains take three times as long."""
 TETHER_RATIO = 1e-9
 """Of the mean stiffness, on every pose: a graph that floats has no unique step."""
 
@@ -245,6 +245,18 @@ def _with_copies(
         elif not seen[i]:
             poses[i], seen[i] = poses[j] @ inverse(T_query_match), True
     return poses
+
+
+def beginning_scale(owned: OwnedClosure, config: BackendConfig) -> float:
+    """Metres per network unit at which a chosen closure begins.
+
+    Where nothing but the choice tells its unit, its covariance is in that unit: poses that nearly meet would make of it
+    one of micrometres. As for a leader it is at least `NEAR_M` long.
+    """
+    if owned.scale is None:
+        return initial_scale(owned.closure, config)
+    length = float(np.linalg.norm(owned.closure.T_query_match_unscaled[:3, 3]))
+    return max(owned.scale, NEAR_M / max(length, TINY))
 
 
 def information_by_keyframe(

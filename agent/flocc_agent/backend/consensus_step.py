@@ -11,10 +11,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend.consensus import ConsensusPart, PartBeginning, information_by_keyframe, part_of
+from flocc_agent.backend.consensus import (
+    ConsensusPart,
+    PartBeginning,
+    beginning_scale,
+    information_by_keyframe,
+    part_of,
+)
 from flocc_agent.backend.consensus_pair import PairedRobot, Tidings, paired
 from flocc_agent.backend.measured import measured_odometry
-from flocc_agent.backend.problem import initial_scale
 from flocc_agent.backend.screening import first_not_rigid
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.own_part import ConsensusProblem, ConsensusState, ConsensusStep, SharedWith, ToldPoses
@@ -101,7 +106,7 @@ def _stepped(config: BackendConfig, problem: ConsensusProblem) -> ConsensusStep:
     assert isinstance(state, PartState)
     state = replace(state, T=_extended(state.T, np.asarray(problem.trajectory.T_odom_keyframe, dtype=float)))
     owned = [each.closure for each in problem.owned]
-    scale = np.array([initial_scale(c.closure, config) if c.scale is None else c.scale for c in problem.owned])
+    scale = np.array([beginning_scale(each, config) for each in problem.owned])
     state = replace(state, copies={**state.copies, **_copies(problem, state)})
     information = _informations(problem, owned, scale, config)
     pairs = {other: _neighbour(problem, state, other, information) for other in problem.shared}

@@ -18,6 +18,7 @@ from flocc_agent.core.parameters import DistributedParameters
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution, LoopClosure, PoseGraph
 from flocc_agent.geometry import inverse
 from flocc_protocol.ids import LogId
+from flocc_protocol.messages import SHARED_MAX
 
 Float = NDArray[np.float64]
 Shown = tuple[int, int, int]
@@ -176,3 +177,16 @@ def used_closures(
             knows = closure.metric or closure.scale_initial is not None
             found.append(OwnedClosure(closure, result.weight, None if knows else result.scale, T_low_high))
     return tuple(found)
+
+
+def shared_of(used: tuple[OwnedClosure, ...]) -> tuple[tuple[int, ...], tuple[OwnedClosure, ...]]:
+    """Keyframes of the higher robot at a pair's closures, evenly fewer where they are too many; and the closures there.
+
+    A robot says at most `SHARED_MAX` poses at once.
+    """
+    shared = sorted({max(each.closure.query, each.closure.match).index for each in used})
+    if len(shared) <= SHARED_MAX:
+        return tuple(shared), used
+    evenly = np.round(np.linspace(0, len(shared) - 1, SHARED_MAX)).astype(int)
+    kept = {shared[k] for k in evenly.tolist()}
+    return tuple(sorted(kept)), tuple(c for c in used if max(c.closure.query, c.closure.match).index in kept)

@@ -20,7 +20,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.closure_choices import FAILURES_MAX, Choosing, ClosureChoices, used_closures
+from flocc_agent.core.closure_choices import FAILURES_MAX, Choosing, ClosureChoices, shared_of, used_closures
 from flocc_agent.core.coming_apart import SILENT_S, ComingApart, beyond
 from flocc_agent.core.correction_evidence import way_m
 from flocc_agent.core.distrust import DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S
@@ -43,7 +43,7 @@ from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND, PATIENCE_S
 from flocc_agent.geometry import inverse, pose_from_tq
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId, Term
-from flocc_protocol.messages import SHARED_MAX, SharedPoses
+from flocc_protocol.messages import SharedPoses
 
 Float = NDArray[np.float64]
 STEPS_AFTER_RESTART = 1000
@@ -509,20 +509,15 @@ class DistributedOptimisation:
         component = next((c for c in solution.components if {self._own, other} <= set(c.logs)), None)
         T = {} if component is None else {log: component.T_map_keyframe[log] for log in (self._own, other)}
         between = [c for c in choosing.graph.closures if c.query.log != c.match.log]
-        used = used_closures(choosing.graph.closures, solution, T, between)
-        shared = sorted({max(each.closure.query, each.closure.match).index for each in used})
-        if len(shared) > SHARED_MAX:
-            evenly = np.round(np.linspace(0, len(shared) - 1, SHARED_MAX)).astype(int)
-            shared = [shared[k] for k in evenly.tolist()]
-            used = tuple(c for c in used if max(c.closure.query, c.closure.match).index in set(shared))
+        shared, used = shared_of(used_closures(choosing.graph.closures, solution, T, between))
         pair = self._pairs.get(other)
         if pair is None:
             if not shared or len(self._pairs) >= NEIGHBOURS_MAX:
                 return
             pair = self._pairs[other] = SharedPair()
-        if tuple(shared) != pair.keyframes or {c.ends for c in used} != {c.ends for c in pair.owned}:
+        if shared != pair.keyframes or {c.ends for c in used} != {c.ends for c in pair.owned}:
             self._list_anew(pair)
-        pair.keyframes, pair.owned = tuple(shared), used
+        pair.keyframes, pair.owned = shared, used
         self._has_news = True
 
     def _list_anew(self, pair: SharedPair) -> None:

@@ -45,10 +45,11 @@ _REVERSED = re.compile(
 )
 """A pose of the fixed frame in the moving one: `q_cw_x`, `p_BW_y`, `t_world_to_cam_z`."""
 _REVERSED_WORDS = re.compile(
-    r"(?:^|_)(?:t_?[bci][wg]|t_?(?:cam|camera|body|imu)_?(?:world|global)|w2c"
+    r"(?:^|_)(?:t_?[bci]_?[wg]|t_?(?:cam|camera|body|imu)_?(?:world|global)|w2c"
+    r"|(?:[bci]|cam|camera|body|imu|sensor|frame|device)_t_(?:[wg]|world|global|map|odom)"
     r"|(?:world|global)_?(?:to|2)_?(?:cam|camera|body|imu)|(?:cam|camera|body|imu)_from_(?:world|global|map))(?:_|$)"
 )
-"""The same in a comment, whose words mean less: `T_body_world`, `world to camera`."""
+"""The same in a comment, whose words mean less: `T_body_world`, `frame_T_global`, `world to camera`."""
 _JPL = re.compile(r"(?:^|_)jpl(?:_|$)")
 _LEFT_HANDED = re.compile(r"(?:^|_)(?:left_?handed|unity(?:3d)?)(?:_|$)")
 _STEPS = re.compile(

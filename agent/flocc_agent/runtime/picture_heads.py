@@ -50,6 +50,7 @@ class PictureHead:
         bits: Per channel.
         orientation: EXIF's, 1 (as stored) to 8.
         largest: Value of white where the file says it (PNM), else None.
+        is_negative: Whether 0 is white (a TIFF's `WhiteIsZero`), which OpenCV passes over.
     """
 
     format: str
@@ -58,6 +59,7 @@ class PictureHead:
     bits: int = 8
     orientation: int = 1
     largest: int | None = None
+    is_negative: bool = False
 
     @property
     def is_turned(self) -> bool:
@@ -204,11 +206,14 @@ def _tiff(data: Encoded) -> PictureHead:
         raise PictureError(
             f"is a TIFF of {bits}-bit numbers that are no pixels (depth or radiance); flocc reads 8 and 16 bits"
         )
+    brightness = page.get(262, (1,))[0]
+    if brightness in UNREAD_BRIGHTNESS:
+        raise PictureError(f"is a TIFF of {UNREAD_BRIGHTNESS[brightness]}, which flocc does not read; write PNG")
     for starts, counts in ((273, 279), (324, 325)):
         parts = zip(page.get(starts, ()), page.get(counts, ()), strict=False)
         _whole(all(start + count <= len(data) for start, count in parts))
     width, height = page.get(256, (0,))[0], page.get(257, (0,))[0]
-    return PictureHead("TIFF", width, height, max(bits, 8), _orientation(page))
+    return PictureHead("TIFF", width, height, max(bits, 8), _orientation(page), is_negative=brightness == 0)
 
 
 def stored_tiff(data: Encoded) -> bytes:
@@ -223,6 +228,14 @@ def stored_tiff(data: Encoded) -> bytes:
     return bytes(patched)
 
 
+UNREAD_BRIGHTNESS = {
+    4: "a mask",
+    8: "CIE L*a*b*",
+    9: "ICC L*a*b*",
+    32803: "a colour filter's raw pixels",
+    34892: "raw pixels",
+}
+"""What a TIFF's PhotometricInterpretation says of pixels that are none to be shown as they are."""
 _ORIENTATION = 274
 _TIFF_PAGES_MAX = 64
 _TIFF_TYPES = {1: "B", 3: "H", 4: "I"}

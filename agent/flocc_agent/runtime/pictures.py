@@ -143,7 +143,9 @@ def decoded(encoded: Encoded, size: Size | None = None) -> Pixels:
         raise PictureError(f"the image cannot be read: it is a damaged {head.format}")
     if bgr.dtype not in (np.uint8, np.uint16):
         raise PictureError(f"the image has pixels of {bgr.dtype}; flocc reads 8 and 16 bits")
-    return _turned(_to_full_range(bgr, head)[..., ::-1], head, size)
+    bright = _to_full_range(bgr, head)
+    bright = np.iinfo(bright.dtype).max - bright if head.is_negative else bright
+    return _turned(bright[..., ::-1], head, size)
 
 
 def _to_full_range(pixels: Pixels, head: PictureHead) -> Pixels:

@@ -146,6 +146,8 @@ def oddity(positions_m: Float, rotations: Float) -> str | None:
     return None
 
 
+RESET_STEPS, RESET_MIN_M = 2.0, 0.1
+"""A step to the origin is so many times the median one that moves, and so long."""
 SPIKE_STEPS = 20.0
 SPIKE_MIN_M = 10.0
 SPIKE_POSES_MIN = 8
@@ -168,6 +170,28 @@ def spikes(positions_m: Float) -> NDArray[np.bool_]:
     away_m = np.minimum(steps_m[:-1], steps_m[1:])
     across_m = np.linalg.norm(positions_m[2:] - positions_m[:-2], axis=1)
     found[1:-1] = (away_m > far_m) & (across_m < 0.1 * away_m)
+    return found
+
+
+def reset_poses(T: Float) -> NDArray[np.bool_]:
+    """Poses (N, 4, 4) that are exactly the identity, between poses of which neither neighbour is near it.
+
+    Programs write it where they have lost themselves. A robot that comes back to where it began gets there in steps
+    like all others, and its numbers never become whole; where it stands there at first, nothing is before it.
+    """
+    at_origin = np.all(np.eye(4) == T, axis=(1, 2))
+    found = np.zeros(len(T), dtype=bool)
+    runs = np.flatnonzero(np.diff(np.concatenate([[False], at_origin, [False]]).astype(int)))
+    steps_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+    moves_m = steps_m[steps_m > STILL_M]
+    if len(runs) == 0 or len(moves_m) == 0:
+        return found
+    far_m = max(RESET_MIN_M, RESET_STEPS * float(np.median(moves_m)))
+    for first, end in zip(runs[::2], runs[1::2], strict=True):
+        before = [float(steps_m[first - 1])] if first > 0 else []
+        after = [float(steps_m[end - 1])] if end < len(T) else []
+        if before and min(before + after) > far_m:
+            found[first:end] = True
     return found
 
 

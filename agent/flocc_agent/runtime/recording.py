@@ -241,12 +241,13 @@ def write_camera(path: Path, camera: Camera, T_body_camera: Float) -> None:
 def _unmeasured(path: Path, odometry: Trajectory, frames_s: Sequence[float]) -> dict[float, OdometryCovariance]:
     """How exact odometry is up to those frames before which nobody measured it, by their stamps."""
     found: dict[float, OdometryCovariance] = {}
-    for k, step in unmeasured(odometry.stamps_s, odometry.T_fixed_body).items():
+    paused = pauses(odometry.stamps_s)
+    for k, step in unmeasured(odometry.stamps_s, odometry.T_fixed_body, paused).items():
         after = bisect_left(frames_s, float(odometry.stamps_s[k]))
         if 0 < after < len(frames_s):
             stamp_s = frames_s[after]
             found[stamp_s] = together([found[stamp_s], step]) if stamp_s in found else step
-    if len(paused := pauses(odometry.stamps_s)):
+    if len(paused):
         from_s, to_s = odometry.stamps_s[paused[0] - 1], odometry.stamps_s[paused[0]]
         more = f" (and in {len(paused) - 1} other pauses)" if len(paused) > 1 else ""
         logger.warning(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, breaks, possible, spikes
+from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, breaks, possible, reset_poses, spikes
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_agent.runtime.trajectory import Trajectory
 
@@ -20,6 +20,8 @@ DAMAGED_RATIO_MAX = 0.2
 JUMPS = "jump away from those on both sides"
 TOO_FAST = f"lie out of reach of the others (faster than {SPEED_MAX_M_S:g} m/s)"
 TOO_FAST_ASKED = ": is the length in metres, and the stamp in its unit?"
+LOST = "are exactly at the origin and not turned amid others that are not, as programs write where they are lost"
+LOST_ASKED = ": take those rows out"
 STRAY_STEPS_MIN = 20.0
 JOINED_MAX, JOINED_ROWS_MIN = 8, 3
 """Trajectories one behind the other in a file, and the rows that each has; more, or shorter ones, are disorder."""
@@ -95,6 +97,10 @@ def in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
     if not np.all(good):
         notes.append(_left_out(path, lines[~good], len(lines), TOO_FAST, TOO_FAST_ASKED))
     stamps_s, T, lines = stamps_s[good], T[good], lines[good]
+    lost = reset_poses(T)
+    if np.any(lost):
+        notes.append(_left_out(path, lines[lost], len(lines), LOST, LOST_ASKED))
+    stamps_s, T, lines = stamps_s[~lost], T[~lost], lines[~lost]
     odd = spikes(T[:, :3, 3])
     if np.any(odd):
         notes.append(_left_out(path, lines[odd], len(lines), JUMPS))

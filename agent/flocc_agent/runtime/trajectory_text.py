@@ -112,6 +112,7 @@ def read_poses(path: Path, form: str | None = None, otherwise: str | None = None
     columns = _columns(table, form, otherwise)
     if columns is None:
         return _matrices(table)
+    _refuse_second_header(table, columns)
     values, lines, notes = _values(table, columns)
     notes = (*notes, *comment_notes(table))
     values[:, 1:4] *= columns.metres
@@ -144,6 +145,27 @@ def _columns(table: Table, form: str | None, otherwise: str | None) -> Columns |
         if len(words) >= 7 and not any(is_number(word.strip()) for word in words):
             raise RecordingError(f"{table.path}:{line}: the header is not understood ({header[:80]}); {WAY_OUT}")
     return _by_numbers(table, count) if otherwise is None else _named_form(otherwise, table.path)
+
+
+def _refuse_second_header(table: Table, columns: Columns) -> None:
+    """Refuse a table whose columns are named anew between its rows, and otherwise.
+
+    Raises:
+        RecordingError: A line between rows, or a comment there, names other columns than those that are read.
+    """
+    worded = (
+        (line, ",".join(fields)) for line, fields in table.rows if fields and not any(is_number(f) for f in fields)
+    )
+    for line, header in (*worded, *table.remarks):
+        try:
+            found = columns_of(header)
+        except HeaderError:
+            continue
+        if found is not None and (found.stamp, found.pose, found.unit) != (columns.stamp, columns.pose, columns.unit):
+            raise RecordingError(
+                f"{table.path}:{line}: names other columns than those of the rows before it ({header[:60]}): the file "
+                "holds several tables; cut it, and convert the parts apart"
+            )
 
 
 def _usual_count(table: Table) -> int:

@@ -39,17 +39,21 @@ def pauses(stamps_s: Float) -> NDArray[np.intp]:
     return np.flatnonzero(steps_s > max(PAUSE_MIN_S, PAUSE_STEPS * float(np.median(steps_s)))) + 1
 
 
-def unmeasured(stamps_s: Float, T_odom_body: Float) -> dict[int, OdometryCovariance]:
+def unmeasured(
+    stamps_s: Float, T_odom_body: Float, paused: NDArray[np.intp] | None = None
+) -> dict[int, OdometryCovariance]:
     """Steps that nobody measured, by the pose that each leads to.
 
     Args:
         stamps_s: (N,) increasing.
         T_odom_body: (N, 4, 4).
+        paused: What `pauses` found in these stamps; None finds it.
 
     Returns:
         How exact these steps are, in the tangent of the later pose.
     """
-    found = {int(k): after_pause(float(stamps_s[k] - stamps_s[k - 1])) for k in pauses(stamps_s)}
+    paused = pauses(stamps_s) if paused is None else paused
+    found = {int(k): after_pause(float(stamps_s[k] - stamps_s[k - 1])) for k in paused}
     for k in np.flatnonzero(breaks(stamps_s, T_odom_body)).tolist():
         found[k] = after_jump(T_odom_body[k - 1], T_odom_body[k])
     return found

@@ -2,22 +2,27 @@
 
 `python -m flocc_lab.bench.consensus_recordings FILE.jrl... [--metric] [--wrong] [--contacts 50] [--loss 0.3]` prints a
 row of Markdown for each file. In a contact each robot in turn does one step and tells each of its neighbours; a message
-is lost with the given probability. Without `--wrong` closures that are labelled as wrong are left out and all
-others used, by both. With it the leader solves all closures at once, and robots choose as in distributed mode: each of
-its own log, the lower one of a pair of both logs. Bytes are those of `ToldPoses`.
+is lost with the given probability. The leader solves all closures at once; robots choose as in distributed mode, each
+of its own log, the lower one of a pair of both logs, and take over with which weight and length a closure was chosen.
+Without `--wrong` closures that are labelled as wrong are left out, and no robust solver is asked. "Above" is the cost
+of what the robots own, over the least that one solver of all of it reaches. Bytes are those of `ToldPoses`.
 """
 
 import argparse
 import sys
 import time
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.config import BackendConfig, Solver
+from flocc_agent.core.closure_choices import shared_of, used_closures
+from flocc_agent.core.own_part import OwnedClosure
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution, LoopClosure, PoseGraph
 from flocc_lab.bench.consensus_sweeps import Sweeps
+from flocc_lab.consensus_graphs import least_cost, whole_of
 from flocc_launch.graph_files import GraphFile, read_graph_file
 from flocc_launch.graph_files.graph_file import ate_m
 from flocc_launch.graph_files.optimise import file_config, positions, prepared
@@ -26,8 +31,8 @@ WITHIN = 1.1
 """Of the leader's ATE: the issue's limit."""
 HEAD = (
     "| recording | leader, m | wrong used | right lost | distributed: wrong used | right lost | within a tenth after "
-    + "| MB | ended, m | MB | CPU s |\n"
-    + "|---" * 11
+    + "| MB | ended, m | above | MB | CPU s |\n"
+    + "|---" * 12
     + "|\n"
 )
 
@@ -39,11 +44,13 @@ class RecordingAgreed:
     Attributes:
         ate_m: Joint ATE after each contact.
         bytes_at: Bytes told by then.
+        above: Cost at the end over the least, less one.
         cpu_s: Of all robots and contacts.
     """
 
     ate_m: tuple[float, ...]
     bytes_at: tuple[int, ...]
+    above: float
     cpu_s: float
 
     def settled(self, limit_m: float) -> int | None:
@@ -66,23 +73,31 @@ def used_of(graph: PoseGraph, solution: GraphSolution) -> set[LoopClosure]:
     return {closure for closure, result in pairs if result.state is ClosureState.USED}
 
 
-def chosen(graph: PoseGraph, config: BackendConfig) -> set[LoopClosure]:
+def chosen(graph: PoseGraph, config: BackendConfig) -> dict[LoopClosure, OwnedClosure]:
     """Closures that robots choose in distributed mode: by one log, and by two."""
-    found: set[LoopClosure] = set()
+    found: dict[LoopClosure, OwnedClosure] = {}
     groups = [{log} for log in graph.trajectories] + [set(pair) for pair in combinations(sorted(graph.trajectories), 2)]
     for logs in groups:
         closures = tuple(c for c in graph.closures if {c.query.log, c.match.log} <= logs)
-        if any({c.query.log, c.match.log} == logs for c in closures):
+        of_all = [c for c in closures if {c.query.log, c.match.log} == logs]
+        if of_all:
             part = PoseGraph({log: graph.trajectories[log] for log in sorted(logs)}, closures)
-            found |= {c for c in used_of(part, solved(part, config)) if {c.query.log, c.match.log} == logs}
+            solution = solved(part, config)
+            component = next((c for c in solution.components if logs <= set(c.logs)), None)
+            T = {} if component is None else {log: component.T_map_keyframe[log] for log in logs}
+            used = used_closures(closures, solution, T, of_all)
+            found |= {each.closure: each for each in (shared_of(used)[1] if len(logs) > 1 else used)}
     return found
 
 
-def agreed(file: GraphFile, used: set[LoopClosure], contacts: int, loss_ratio: float, seed: int) -> RecordingAgreed:
-    """Let robots agree on a recording with the closures that are used."""
-    graph = replace(file.graph, closures=tuple(c for c in file.graph.closures if c in used))
+def agreed(
+    file: GraphFile, owned: Mapping[LoopClosure, OwnedClosure], contacts: int, loss_ratio: float, seed: int
+) -> RecordingAgreed:
+    """Let robots agree on a recording with the closures that they chose."""
+    graph = replace(file.graph, closures=tuple(c for c in file.graph.closures if c in owned))
     began = time.process_time()
-    team = Sweeps(graph, file_config(None, Solver.LM, None), loss_ratio, seed)
+    team = Sweeps(graph, file_config(None, Solver.LM, None), loss_ratio, seed, owned)
+    least = least_cost(team.parts)
     errors: list[float] = []
     told: list[int] = []
     for _ in range(contacts):
@@ -92,13 +107,14 @@ def agreed(file: GraphFile, used: set[LoopClosure], contacts: int, loss_ratio: f
             sys.exit("a recording without true positions")
         errors.append(error_m)
         told.append(team.payload_bytes)
-    return RecordingAgreed(tuple(errors), tuple(told), time.process_time() - began)
+    above = whole_of(team.parts).own_cost() / least - 1.0
+    return RecordingAgreed(tuple(errors), tuple(told), above, time.process_time() - began)
 
 
-def choice(file: GraphFile, used: set[LoopClosure]) -> str:
+def choice(file: GraphFile, used: Collection[LoopClosure]) -> str:
     """Wrong closures used and right ones lost, as two cells."""
     wrong = {c for k, c in enumerate(file.graph.closures) if k in file.outliers}
-    return f"{len(used & wrong)} | {len(set(file.graph.closures) - wrong - used)}"
+    return f"{len(wrong & set(used))} | {len(set(file.graph.closures) - wrong - set(used))}"
 
 
 def row(path: Path, options: argparse.Namespace) -> str:
@@ -108,14 +124,14 @@ def row(path: Path, options: argparse.Namespace) -> str:
     solution = solved(file.graph, config)
     leader_m = ate_m(positions(solution), file.truth_m) or 0.0
     leaders = used_of(file.graph, solution)
-    used = chosen(file.graph, config) if options.wrong else leaders
+    used = chosen(file.graph, config)
     found = agreed(file, used, options.contacts, options.loss, options.seed)
     after = found.settled(WITHIN * leader_m)
     megabytes = "" if after is None else f"{found.bytes_at[after - 1] / 1e6:.2f}"
     return (
         f"| {path.stem} | {leader_m:.3f} | {choice(file, leaders)} | {choice(file, used)} "
         f"| {after or 'no'} | {megabytes} "
-        f"| {found.ate_m[-1]:.3f} | {found.bytes_at[-1] / 1e6:.2f} | {found.cpu_s:.1f} |\n"
+        f"| {found.ate_m[-1]:.3f} | {found.above:.2%} | {found.bytes_at[-1] / 1e6:.2f} | {found.cpu_s:.1f} |\n"
     )
 
 

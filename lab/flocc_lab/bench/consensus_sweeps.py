@@ -19,7 +19,8 @@ from flocc_agent.backend.alignment import align
 from flocc_agent.backend.consensus import ConsensusPart
 from flocc_agent.backend.consensus_pair import Tidings
 from flocc_agent.config import BackendConfig, Formulation, Solver
-from flocc_agent.core.pose_graph import PoseGraph, Trajectory
+from flocc_agent.core.own_part import OwnedClosure
+from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
 from flocc_lab.consensus_graphs import part_of_graph, solved_alone
 from flocc_lab.experiments.distributed import OPTIMA
 from flocc_lab.rbcd.run import cut_by_time, graph_cost
@@ -35,8 +36,15 @@ TORUS_OPTIMUM = 24227.09
 class Sweeps:
     """Robots that agree on one graph, and what they have told so far."""
 
-    def __init__(self, graph: PoseGraph, config: BackendConfig, loss_ratio: float = 0.0, seed: int = 0) -> None:
-        self.parts = begun(graph, config)
+    def __init__(
+        self,
+        graph: PoseGraph,
+        config: BackendConfig,
+        loss_ratio: float = 0.0,
+        seed: int = 0,
+        chosen: Mapping[LoopClosure, OwnedClosure] | None = None,
+    ) -> None:
+        self.parts = begun(graph, config, chosen or {})
         self.payload_bytes = 0
         self.refused = 0
         self.sweeps = 0
@@ -64,15 +72,15 @@ class Sweeps:
                         self.refused += 1
 
 
-def begun(graph: PoseGraph, config: BackendConfig) -> dict[LogId, ConsensusPart]:
+def begun(
+    graph: PoseGraph, config: BackendConfig, chosen: Mapping[LoopClosure, OwnedClosure]
+) -> dict[LogId, ConsensusPart]:
     """Each robot solved alone, then placed in the frame of the lowest by the closures between them."""
-    T_alone = {
-        log: solved_alone(part_of_graph(graph, log, config, np.asarray(trajectory.T_odom_keyframe, dtype=float)))
-        for log, trajectory in sorted(graph.trajectories.items())
-    }
+    T_odom = {log: np.asarray(t.T_odom_keyframe, dtype=float) for log, t in sorted(graph.trajectories.items())}
+    T_alone = {log: solved_alone(part_of_graph(graph, log, config, T, chosen)) for log, T in T_odom.items()}
     moved = {log: Trajectory(T, graph.trajectories[log].edge_covariances) for log, T in T_alone.items()}
     T_map_odom, _ = align(moved, dict(enumerate(graph.closures)), config.steepness)
-    return {log: part_of_graph(graph, log, config, T_map_odom[log] @ T) for log, T in T_alone.items()}
+    return {log: part_of_graph(graph, log, config, T_map_odom[log] @ T, chosen) for log, T in T_alone.items()}
 
 
 @dataclass(frozen=True, slots=True)

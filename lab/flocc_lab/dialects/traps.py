@@ -3,8 +3,8 @@
 Each kind was found by people who tried to break the readers: half of one robot beside half of another, transforms of
 robots whose frames have the same names, goals beside odometry, cameras beyond the first of a chain, matrices column by
 column, several models of one reconstruction, an applied scale, the last frame of a video, options that a source does
-not use, a time shift, a phone's folders, and those of `named_traps` and `unread_traps`. Everything else of an input is
-drawn.
+not use, a time shift, a phone's folders, and those of `named_traps`, `unread_traps` and `twice_traps`. Everything else
+of an input is drawn.
 
     python -m flocc_lab.dialects.traps --count 200 --seed 1
 """
@@ -42,6 +42,7 @@ from flocc_lab.dialects.trap_parts import (
     written,
     written_bag,
 )
+from flocc_lab.dialects.twice_traps import TWICE_TRAPS
 from flocc_lab.dialects.unread_traps import UNREAD_TRAPS
 from flocc_launch.datasets.commands import COUNTS_FOR, convert
 from flocc_launch.datasets.detect import read_source
@@ -369,6 +370,7 @@ TRAPS: dict[str, Callable[[Rng, Path], Trap]] = {
     "the end of a video": video,
     **NAMED_TRAPS,
     **UNREAD_TRAPS,
+    **TWICE_TRAPS,
 }
 
 

@@ -11,6 +11,7 @@ import argparse
 import math
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,24 +72,59 @@ def rays_of(model: CameraModel) -> Float:
     return np.stack(rays, axis=-1)
 
 
-def write_wide(source_path: Path, out: Path, kind: LensKind) -> Path:
-    """Write one robot's data set as a wide lens would have taken it, with a camchain of Kalibr."""
+def enlarged(camera: Camera, finer: int) -> Camera:
+    """The camera of pictures with so many times the pixels a side; pixel (0, 0) is the centre of the first one."""
+    at = (finer - 1) / 2
+    return replace(
+        camera,
+        width=finer * camera.width,
+        height=finer * camera.height,
+        fx=finer * camera.fx,
+        fy=finer * camera.fy,
+        cx=finer * camera.cx + at,
+        cy=finer * camera.cy + at,
+    )
+
+
+def write_enlarged(source_path: Path, out: Path, finer: int) -> Path:
+    """Write one robot's data set with so many times the pixels a side, which hold nothing that was not there."""
+    return _write(source_path, out, finer, None)
+
+
+def write_wide(source_path: Path, out: Path, kind: LensKind, finer: int = 1) -> Path:
+    """Write one robot's data set as a wide lens would have taken it, with a camchain of Kalibr.
+
+    Args:
+        source_path: The data set.
+        out: A folder that is made anew.
+        kind: Of the lens.
+        finer: So many times the pixels a side, so that interpolation between them dulls nothing.
+    """
+    return _write(source_path, out, finer, kind)
+
+
+def _write(source_path: Path, out: Path, finer: int, kind: LensKind | None) -> Path:
     import cv2
 
     source = read_source(source_path)
     if source.lens is None:
         raise DatasetError(f"{source_path}: has no intrinsics")
-    camera = agents_camera(source.lens)
-    model = wide_model(camera, kind)
-    rays = rays_of(model)
-    x = (rays[..., 0] / rays[..., 2] * camera.fx + camera.cx).astype(np.float32)
-    y = (rays[..., 1] / rays[..., 2] * camera.fy + camera.cy).astype(np.float32)
+    own = agents_camera(source.lens)
+    camera = enlarged(own, finer)
+    model = CameraModel.of_camera(camera) if kind is None else wide_model(camera, kind)
+    x, y = np.meshgrid(*(np.arange(side, dtype=float) for side in (camera.width, camera.height)))
+    if kind is not None:
+        rays = rays_of(model)
+        x = rays[..., 0] / rays[..., 2] * camera.fx + camera.cx
+        y = rays[..., 1] / rays[..., 2] * camera.fy + camera.cy
+    at_x, at_y = (((each - (finer - 1) / 2) / finer).astype(np.float32) for each in (x, y))
     shutil.rmtree(out, ignore_errors=True)
     (out / "images").mkdir(parents=True)
     for stamp_s, file in source.images:
         pixels = cv2.imdecode(np.frombuffer(read_bytes(file), np.uint8), cv2.IMREAD_COLOR)
         assert pixels is not None
-        wide = cv2.remap(pixels, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+        border = cv2.BORDER_CONSTANT if kind is not None else cv2.BORDER_REPLICATE
+        wide = cv2.remap(pixels, at_x, at_y, cv2.INTER_CUBIC, borderMode=border)
         cv2.imwrite(str(out / "images" / f"{stamp_s:.6f}.jpg"), wide, [cv2.IMWRITE_JPEG_QUALITY, 97])
     (out / "camera.yaml").write_text(kalibr(Rig(model, source.lens.T_body_camera)), encoding="utf-8")
     for name, trajectory in (("odometry", source.odometry), ("groundtruth", source.truth)):
@@ -103,8 +139,9 @@ def main() -> None:
     parser.add_argument("source", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--kind", type=LensKind, default=LensKind.EQUIDISTANT)
+    parser.add_argument("--finer", type=int, default=1, help="so many times the pixels a side")
     options = parser.parse_args()
-    write_wide(options.source, options.out, options.kind)
+    write_wide(options.source, options.out, options.kind, options.finer)
     lens = read_source(options.source).lens
     assert lens is not None
     view_deg = 2 * math.degrees(math.atan(lens.camera.width / 2 / lens.camera.fx))

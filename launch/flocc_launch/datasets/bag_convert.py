@@ -29,6 +29,7 @@ from flocc_launch.datasets.bag_messages import (
 from flocc_launch.datasets.bag_poses import PoseDecoder, TransformDecoder
 from flocc_launch.datasets.bag_reader import Bag, BagTopic
 from flocc_launch.datasets.camera_clock import of_pictures, told
+from flocc_launch.datasets.covered import Covered
 from flocc_launch.datasets.intrinsics import believable, read_lens
 from flocc_launch.datasets.journeys import JourneyWatch
 from flocc_launch.datasets.names import robot_name
@@ -46,6 +47,8 @@ STAMPS_TRIED = 60
 """Of the first pictures and poses, to see whether they are stamped alike."""
 DAMAGED_RATIO_MAX = 0.2
 """A topic of which more messages are damaged is refused."""
+JOURNEYS_MAX, JOURNEYS_RATIO_MAX = 3, 0.02
+"""Odometry that begins anew more often, and in more of its messages, is of two programs."""
 HEADER_BYTES = 12
 """Of a raw message before the name of its frame."""
 
@@ -338,6 +341,7 @@ class _Conversion:
     _infos_differ: int = 0
     _image_span_s: tuple[float, float] | None = None
     _pose_span_s: tuple[float, float] | None = None
+    _covered: Covered = field(default_factory=Covered)
 
     def topics(self) -> list[str]:
         """Names of the topics of which messages are wanted."""
@@ -390,6 +394,8 @@ class _Conversion:
         writer, log = self._writer, self._log
         try:
             writer.sort()
+            if self.robot.poses is not None and self.start_ns is None:
+                self._covered.count(writer.path / "images.txt")
             log.finish(self.zero_ns)
             self._write_beside(writer)
         finally:
@@ -428,6 +434,7 @@ class _Conversion:
                 self._pose_span_s = _wider(self._pose_span_s, (good_ns - self.zero_ns) * 1e-9)
                 if good_ns > self._log.last_ns:
                     self._see_motion(good)
+                    self._covered.posed((good_ns - self.zero_ns) * 1e-9)
                 if len(posed) == 1 and good_ns == self._log.last_ns and good != self._last_pose:
                     self.poses.damage("the stamp is that of the pose before")
                 elif not self._log.add(good_ns, good) and len(posed) == 1:
@@ -540,6 +547,12 @@ class _Conversion:
         if self.watch.outliers:
             jumps = f"{self.watch.outliers} single poses jump, and were left out"
             self.notes.append(f"{self.bag.path}: topic {self.robot.poses}: {jumps}")
+        if self.journey > JOURNEYS_MAX and self.journey > JOURNEYS_RATIO_MAX * self.poses.seen:
+            self.faults.append(
+                f"{self.bag.path}: topic {self.robot.poses}: odometry begins anew {self.journey} times in "
+                f"{self.poses.seen} messages, as where two programs publish on one topic; record one of them"
+            )
+        self.notes.extend(f"{self.bag.path}: {note}" for note in self._covered.told(f"odometry ({self.robot.poses})"))
         unturned = np.array(self._unturned or np.empty((0, 7)))
         if (odd := oddity(unturned[:, :3], unturned[:, 3:])) is not None:
             self.notes.append(f"{self.bag.path}: topic {self.robot.poses}: {odd}")

@@ -10,7 +10,7 @@ import numpy as np
 
 from flocc_agent.lenses import CameraModel, LensKind
 from flocc_agent.runtime.pictures import FULL
-from flocc_agent.runtime.recording import MASK, read_mask
+from flocc_agent.runtime.recording import MASK, read_camera, read_image_list, read_mask
 from flocc_agent.runtime.straightening import Straightener
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
@@ -25,10 +25,12 @@ from flocc_launch.datasets.drift import DriftKind, DriftSpec, drifted, fitted, k
 from flocc_launch.datasets.names import robot_names
 from flocc_launch.datasets.picture_check import seen_faults
 from flocc_launch.datasets.plain import ODOMETRY_STEMS, TRUTH_STEMS, expected_files, taken_file
-from flocc_launch.datasets.source import DatasetError, Source
+from flocc_launch.datasets.source import DatasetError, Lens, Source
+from flocc_launch.datasets.truth_clock import truth_faults
 from flocc_launch.datasets.unread import unused
 from flocc_launch.datasets.video import (
     WHAT_ODOMETRY,
+    beside_notes,
     convert_video,
     is_video,
     lens_beside,
@@ -259,6 +261,7 @@ def _video_info(path: Path) -> Info:
         truth_poses=None,
         length_m=None if trajectory is None else trajectory.length_m(),
         faults=tuple(lacks),
+        notes=tuple(beside_notes(path)),
     )
 
 
@@ -292,7 +295,7 @@ def clock(path: Path, odometry: Path | None = None, camera: Path | None = None, 
     Raises:
         DatasetError: There is no trajectory or calibration, or the pictures do not tell.
     """
-    source = read_source(path, None, camera, form if odometry is None else None, time_offset_s=None)
+    source = read_source(path, None, camera, form if odometry is None else None, None, odometry)
     trajectory = source.odometry or source.truth if odometry is None else read_trajectory(odometry, form)[0]
     if trajectory is None:
         raise DatasetError(f"{path}: has neither odometry nor ground truth ({expected_files(path)})")
@@ -373,14 +376,16 @@ def convert(
             robot=robot,
             view_rad=None if view_deg is None else math.radians(view_deg),
         )
-        return convert_bag(path, out, options, progress)
+        convert_bag(path, out, options, progress)
+        _see_recordings(out)
+        return out
     if kind == "video":
         view_rad = None if view_deg is None else math.radians(view_deg)
         for note in convert_video(path, out, camera, odometry, form, every, progress, view_rad):
             logger.warning("%s", note)
         return out
     own_form = form if odometry is None else None
-    source = _viewed(read_source(path, format_name, camera, own_form, time_offset_s), view_deg)
+    source = _viewed(read_source(path, format_name, camera, own_form, time_offset_s, odometry), view_deg)
     _tell(source, camera, odometry)
     identity = _identity(
         f"convert time_offset_s={time_offset_s}" if time_offset_s else "convert", path, source, drift, seed
@@ -506,14 +511,29 @@ def _see_pictures(source: Source, given: Trajectory | None, is_settled: bool) ->
     """
     trajectory = given or source.odometry or source.truth
     if trajectory is not None:
-        _log(seen_faults(source, trajectory, is_settled))
+        _log((*seen_faults(source, trajectory, is_settled), *truth_faults(source, trajectory)))
+
+
+def _see_recordings(out: Path) -> None:
+    """Log what pictures contradict of the odometry of a bag's recordings, of one robot or of several."""
+    folders = [out] if (out / "images.txt").exists() else sorted(file.parent for file in out.glob("*/images.txt"))
+    for folder in folders:
+        try:
+            images = tuple(read_image_list(folder / "images.txt"))
+            odometry = read_trajectory(folder / "odometry.tum")[0]
+            lens = Lens(*read_camera(folder / "camera.toml"))
+        except FloccError:  # without images or poses, as an agent will say
+            continue
+        _see_pictures(Source(folder, "bag", images, lens), odometry, True)
 
 
 def _seen(source: Source, is_settled: bool) -> tuple[str, ...]:
     """The same in sentences, where nothing is converted."""
     trajectory = source.odometry or source.truth
     try:
-        return () if trajectory is None else seen_faults(source, trajectory, is_settled)
+        if trajectory is None:
+            return ()
+        return (*seen_faults(source, trajectory, is_settled), *truth_faults(source, trajectory))
     except DatasetError as error:
         return (str(error),)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from flocc_agent.runtime.columns import UNITS_S
 from flocc_agent.runtime.trajectory import NEAR_S, Trajectory
+from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_reader import is_bag
 from flocc_launch.datasets.camera_clock import of_pictures, told
 from flocc_launch.datasets.folders import (
@@ -23,13 +24,22 @@ from flocc_launch.datasets.kitti_raw import image_folder, read_kitti_raw
 from flocc_launch.datasets.names import robot_name
 from flocc_launch.datasets.other_kinds import kind_of_file, kind_of_folder, marked_kind
 from flocc_launch.datasets.pixels import size_of, usable_images
-from flocc_launch.datasets.plain import has_trajectory, is_plain, read_plain
+from flocc_launch.datasets.plain import (
+    BESIDE_READ,
+    TRUTH_STEMS,
+    has_trajectory,
+    is_plain,
+    odometry_stems,
+    read_plain,
+    trajectory_files,
+)
 from flocc_launch.datasets.reconstructions import (
     colmap_folder,
     read_colmap,
     read_replica,
     read_transforms,
 )
+from flocc_launch.datasets.said_twice import see_one_camera, see_one_trajectory
 from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.video import files_beside, is_video
 
@@ -180,6 +190,7 @@ def read_source(
     camera: Path | None = None,
     form: str | None = None,
     time_offset_s: float | None = 0.0,
+    odometry: Path | None = None,
 ) -> Source:
     """Read one robot's data set.
 
@@ -189,23 +200,45 @@ def read_source(
         camera: Intrinsics, where the folder has none or others are wanted.
         form: Of the trajectories of a plain folder (`trajectory_text.FORMS`); None finds out.
         time_offset_s: Added to the stamps of trajectories; None leaves them as they are and unchecked.
+        odometry: A file that counts in place of the folder's, which then need not agree; it is not read here.
 
     Raises:
-        DatasetError: Unknown, or nothing in it can be used.
+        DatasetError: Unknown, nothing in it can be used, or its files contradict each other.
     """
     name = format_name or detect_format(path)
     if name not in READERS:
         raise DatasetError(f"{path}: the format {name!r} is not known; there are {', '.join(READERS)}")
     source = _read(path, name, form)
+    if odometry is None:
+        source = _with_odometry_beside(source, form)
+    stamps_s = [stamp_s for stamp_s, _ in source.images]
+    see_one_trajectory(source.truth, trajectory_files(path, TRUTH_STEMS), form, stamps_s, way_out="")
+    if camera is None:
+        source = replace(source, notes=(*source.notes, *see_one_camera(source)))
     lens = source.lens if camera is None else read_lens(camera, size_of(source.images))
     source = _of_body_clock(replace(source, lens=lens))
     if time_offset_s:
-        odometry, truth = (t.later(time_offset_s) if t is not None else None for t in (source.odometry, source.truth))
-        source = replace(source, odometry=odometry, truth=truth)
+        moved, truth = (t.later(time_offset_s) if t is not None else None for t in (source.odometry, source.truth))
+        source = replace(source, odometry=moved, truth=truth)
     for trajectory in (source.odometry, source.truth):
         if trajectory is not None and time_offset_s is not None:
             check_times(source, trajectory)
     return _usable(source)
+
+
+def _with_odometry_beside(source: Source, form: str | None) -> Source:
+    """The source with the odometry that stands in its folder, whatever data set it is.
+
+    Raises:
+        DatasetError: Two files of odometry tell different motions.
+    """
+    files = trajectory_files(source.path, odometry_stems(source.format))
+    stamps_s = [stamp_s for stamp_s, _ in source.images]
+    if source.odometry is None and source.format not in BESIDE_READ and files:
+        odometry, notes = read_trajectory(files[0], form, stamps_s)
+        source = replace(source, odometry=odometry, notes=(*source.notes, *notes))
+    see_one_trajectory(source.odometry, files, form, stamps_s)
+    return source
 
 
 def _of_body_clock(source: Source) -> Source:

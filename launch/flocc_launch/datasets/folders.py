@@ -18,6 +18,7 @@ from flocc_agent.runtime.trajectory import Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.files import (
     camera_file,
+    camera_files,
     image_files,
     image_numbers,
     image_rows,
@@ -28,9 +29,9 @@ from flocc_launch.datasets.files import (
     unequal,
 )
 from flocc_launch.datasets.intrinsics import mounting_of, read_lens
-from flocc_launch.datasets.kitti_raw import rectified_lens
+from flocc_launch.datasets.kitti_raw import rectified, rectified_lens
 from flocc_launch.datasets.pixels import Stamped, image_size
-from flocc_launch.datasets.plain import trajectories_beside
+from flocc_launch.datasets.plain import TRUTH_STEMS, taken_file, trajectories_beside
 from flocc_launch.datasets.source import DatasetError, Lens, Source
 
 Float = NDArray[np.float64]
@@ -58,26 +59,30 @@ def read_tum_rgbd(path: Path) -> Source:
         if lens is None and re.search(rf"{name}(?!\d)", path.resolve().name):
             lens = Lens(CameraModel(640, 480, fx, fy, cx, cy, (*distortion, k3)))
     truth, notes = read_trajectory(path / "groundtruth.txt", otherwise="tum")
-    return Source(path, "tum", images, lens, truth=truth, faults=faults, notes=notes)
+    calibrations = tuple(camera_files(path))
+    return Source(path, "tum", images, lens, truth=truth, faults=faults, notes=notes, calibrations=calibrations)
 
 
 def read_euroc(path: Path) -> Source:
     """Read an EuRoC ASL sequence's left camera: `mav0/cam0`, ground truth of the IMU body."""
     mav = path / "mav0" if (path / "mav0").is_dir() else path
     images, faults, image_notes = _euroc_images(mav / "cam0")
-    lens = (
-        read_lens(mav / "cam0" / "sensor.yaml")
-        if (mav / "cam0" / "sensor.yaml").exists()
-        else camera_file(path, images) or camera_file(path / "dso", images)
-    )
+    sensor = mav / "cam0" / "sensor.yaml"
+    lens = read_lens(sensor) if sensor.exists() else camera_file(path, images) or camera_file(path / "dso", images)
+    calibrations = (*([sensor] if sensor.exists() else []), *camera_files(path), *camera_files(path / "dso"))
     odometry, truth, notes = trajectories_beside(path)
     file = next((mav / name / "data.csv" for name in EUROC_TRUTHS if (mav / name / "data.csv").exists()), None)
     if file is not None:
         truth, truth_notes = read_trajectory(file, otherwise="euroc")
         truth = _of_body(truth, file.with_name("sensor.yaml"))
-        notes = (*notes, *truth_notes)
+        beside = taken_file(path, TRUTH_STEMS)
+        told = () if beside is None else (f"{file}: was taken as the ground truth, not {beside.name}",)
+        notes = (*notes, *truth_notes, *told)
     notes = (*image_notes, *notes)
-    return Source(path, "euroc", images, lens, odometry=odometry, truth=truth, faults=faults, notes=notes)
+    return Source(
+        path, "euroc", images, lens, odometry=odometry, truth=truth, faults=faults, notes=notes,
+        calibrations=calibrations,
+    )  # fmt: skip
 
 
 def _of_body(truth: Trajectory, sensor: Path) -> Trajectory:
@@ -148,14 +153,17 @@ def read_kitti(path: Path) -> Source:
         faults = (*faults, *unequal(folder, len(files), times if times.exists() else path, stamps, of_images))
     rows = numbers if by_number else image_rows(files, len(stamps_s))
     images = tuple((stamps_s[row], file) for row, file in zip(rows, files, strict=True) if row < len(stamps_s))
-    calibration, number = path / "calib.txt", "2" if folder.name == "image_2" else "0"
+    own = rectified(path / "calib.txt", "2" if folder.name == "image_2" else "0")
+    has_own = (path / "calib.txt").exists() and bool(files)
     lens = camera_file(path, images)
-    if lens is None and calibration.exists() and files:
-        lens = rectified_lens(calibration, number, files[0])
+    if lens is None and has_own:
+        lens = rectified_lens(own, files[0])
     shown = some(images, folder)
+    calibrations = (*camera_files(path), *([own] if has_own else []))
     return Source(
-        path, "kitti", shown, lens, truth=truth, up_world=UP_CAMERA, faults=faults, notes=notes, is_posed_by_image=True
-    )
+        path, "kitti", shown, lens, truth=truth, up_world=UP_CAMERA, faults=faults, notes=notes, is_posed_by_image=True,
+        calibrations=calibrations,
+    )  # fmt: skip
 
 
 def posed(stamps_s: list[float], poses: list[Float], file: Path) -> tuple[Trajectory, tuple[str, ...]]:
@@ -204,7 +212,8 @@ def read_sevenscenes(path: Path) -> Source:
     if orphans > 0:
         faults = (*faults, f"{path}: has {orphans} poses more than images")
     truth = Trajectory(np.array([stamp_s for stamp_s, _ in images]), np.array(poses))
-    lens = camera_file(path, images) or _sevenscenes_lens(path, images[0][1])
+    own = next((path / name for name in SEVENSCENES_LENSES if (path / name).exists()), None)
+    lens = camera_file(path, images) or _sevenscenes_lens(own, images[0][1])
     return Source(
         path,
         "7scenes",
@@ -215,6 +224,7 @@ def read_sevenscenes(path: Path) -> Source:
         faults=faults,
         notes=notes,
         is_posed_by_image=True,
+        calibrations=(*camera_files(path), *([own] if own is not None else [])),
     )
 
 
@@ -229,10 +239,9 @@ SEVENSCENES_LENSES = ("camera-intrinsics.txt", "_info.txt")
 """Where 7-Scenes and BundleFusion, which names its files alike, say the intrinsics."""
 
 
-def _sevenscenes_lens(path: Path, image: Path) -> Lens | None:
+def _sevenscenes_lens(file: Path | None, image: Path) -> Lens | None:
     """Intrinsics of a file, else the published ones for images of their shape, scaled to their size."""
     width, height = image_size(image)
-    file = next((path / name for name in SEVENSCENES_LENSES if (path / name).exists()), None)
     if file is None:
         if width * SEVENSCENES_SIZE[1] != height * SEVENSCENES_SIZE[0]:
             return None

@@ -6,7 +6,7 @@ The calibration stands in the drive's folder or in the one above.
 from pathlib import Path
 
 from flocc_agent.runtime.text_tables import numbered_lines
-from flocc_launch.datasets.files import camera_file, image_files, image_rows, some, unequal
+from flocc_launch.datasets.files import camera_file, camera_files, image_files, image_rows, some, unequal
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import image_size
 from flocc_launch.datasets.plain import trajectories_beside
@@ -40,8 +40,13 @@ def read_kitti_raw(path: Path) -> Source:
     odometry, truth, notes = trajectories_beside(path, None, [stamp_s for stamp_s, _ in images])
     if (path / "oxts").is_dir():
         notes = (*notes, f"{path}: oxts (GPS and inertial) is not read; convert it to odometry.tum or groundtruth.tum")
-    lens = camera_file(path) or _lens(path, folder.name, files)
-    return Source(path, "kitti-raw", images, lens, odometry=odometry, truth=truth, faults=faults, notes=notes)
+    own = _calibration(path, folder.name)
+    lens = camera_file(path) or (rectified_lens(own, files[0]) if own is not None and files else None)
+    calibrations = (*camera_files(path), *([own] if own is not None else []))
+    return Source(
+        path, "kitti-raw", images, lens, odometry=odometry, truth=truth, faults=faults, notes=notes,
+        calibrations=calibrations,
+    )  # fmt: skip
 
 
 def _stamps_s(path: Path) -> list[float]:
@@ -59,16 +64,21 @@ def _stamps_s(path: Path) -> list[float]:
     return stamps_s
 
 
-def _lens(path: Path, camera: str, files: list[Path]) -> Lens | None:
+def _calibration(path: Path, camera: str) -> Path | None:
     """The rectified camera of the day, from the drive's folder or the one above."""
     file = next((p for p in (path / CALIBRATION, path.parent / CALIBRATION) if p.exists()), None)
-    return None if file is None or not files else rectified_lens(file, camera[-2:], files[0])
+    return None if file is None else rectified(file, camera[-2:])
 
 
-def rectified_lens(file: Path, number: str, image: Path) -> Lens:
-    """Intrinsics of row `P_rect_NN`, or `PN`, and where that camera is in camera 0.
+def rectified(file: Path, number: str) -> Path:
+    """A calibration of KITTI's and its row `P_rect_NN`, or `PN`."""
+    return file.with_name(f"{file.name}#P{int(number)}")
+
+
+def rectified_lens(calibration: Path, image: Path) -> Lens:
+    """Intrinsics of a row of a calibration (`rectified`), and where that camera is in camera 0.
 
     Raises:
         DatasetError: There is no such row of 12 numbers.
     """
-    return read_lens(file.with_name(f"{file.name}#P{int(number)}"), image_size(image))
+    return read_lens(calibration, image_size(image))

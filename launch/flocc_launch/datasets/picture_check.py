@@ -22,11 +22,12 @@ from flocc_agent.perception.watch.camera_verdict import (
     CameraVerdict,
     WatchedPair,
     camera_verdict,
+    evidence,
     shows_camera,
 )
 from flocc_agent.perception.watch.camera_watch import SeesFlow
-from flocc_agent.perception.watch.mount_fit import Motions, constant_turn, costs, motions_of, trimmed
-from flocc_agent.perception.watch.seen_motion import Flow
+from flocc_agent.perception.watch.mount_fit import Motions, constant_turn, costs, motions_of, trimmed, turn_costs
+from flocc_agent.perception.watch.seen_motion import Flow, SeenMotion
 from flocc_agent.runtime.picture_heads import PictureError
 from flocc_agent.runtime.pictures import read_picture
 from flocc_agent.runtime.quaternion_order import rotations
@@ -49,10 +50,13 @@ BETTER_MIN_RATIO = 2.5
 """How much less the other reading must leave; it leaves a quarter at most where it is right."""
 PREFER_MIN_RATIO = 0.75
 """Of the pairs those that must prefer the other reading."""
+OFFSET_MAX_S, OFFSET_STEP_S, OFFSET_MIN_S = 2.0, 0.1, 0.15
+"""Differences of clocks that are tried, and what is told; `clocks` measures them over all pictures and any range."""
+OFFSET_PAIRS_MIN, OFFSET_EVIDENCE_MIN = 5, 8.0
 ORDERS = {-1: ("x y z w", "w x y z", "tum-wxyz"), 1: ("w x y z", "x y z w", "tum")}
 """By how many places a quaternion's numbers move round: how they were read, how they must be, and the form's name."""
-POSED_BY_MATRICES = ("kitti", "7scenes", "colmap", "transforms", "replica")
-"""Formats without quaternions whose order a line of the file could say wrongly."""
+POSED_BY_MATRICES = ("kitti", "7scenes", "colmap", "transforms", "replica", "bag")
+"""Formats without quaternions whose order a line of the file could say wrongly; a bag's have names."""
 WAY_OUT = "flocc dataset convert --trajectory-format"
 
 
@@ -64,11 +68,13 @@ class PictureVerdict:
         order: Of `ORDERS`, where only the quaternion's other order fits them.
         camera: What else is wrong, as a running robot would tell it.
         pairs: Of pictures that say so.
+        later_s: How much later the trajectory turns by its stamps than the pictures do, where that explains them.
     """
 
     order: int | None
     camera: CameraVerdict | None
     pairs: int
+    later_s: float | None = None
 
 
 def seen_faults(source: Source, trajectory: Trajectory, is_settled: bool = False) -> tuple[str, ...]:
@@ -83,7 +89,14 @@ def seen_faults(source: Source, trajectory: Trajectory, is_settled: bool = False
         DatasetError: They contradict the order of the quaternions, which nobody has settled.
     """
     pairs = posed_pairs(source, trajectory)
-    verdict = verdict_of(pairs) if pairs else None
+    verdict = verdict_of(pairs, trajectory) if pairs else None
+    if verdict is not None and verdict.later_s is not None:
+        when = "later" if verdict.later_s > 0 else "earlier"
+        return (
+            f"{source.path}: the trajectory turns about {abs(verdict.later_s):.1f} s {when} than the pictures do "
+            f"({verdict.pairs} pairs of pictures): their clocks differ; flocc dataset clock measures by how much, and "
+            "--time-offset mends it",
+        )
     if verdict is None or (verdict.order is not None and source.format in POSED_BY_MATRICES):
         return ()
     if verdict.camera is not None:
@@ -119,8 +132,13 @@ def _told(verdict: CameraVerdict) -> str:
     return f"pictures and trajectory do not go together: {sentences[verdict.fault]}"
 
 
-def verdict_of(pairs: Sequence["PosedPair"]) -> PictureVerdict | None:
-    """What pairs say; None where they agree with the trajectory, or tell nothing."""
+def verdict_of(pairs: Sequence["PosedPair"], trajectory: Trajectory | None = None) -> PictureVerdict | None:
+    """What pairs say; None where they agree with the trajectory, or tell nothing.
+
+    Args:
+        pairs: Matches with poses.
+        trajectory: That the poses are of, to see whether it fits at other times; None looks at nothing else.
+    """
     watched = [WatchedPair(pair.flow) for pair in pairs]
     if not shows_camera(watched):
         return None
@@ -133,8 +151,36 @@ def verdict_of(pairs: Sequence["PosedPair"]) -> PictureVerdict | None:
             is_better = BETTER_MIN_RATIO * trimmed(other) < trimmed(left)
             if is_better and float(np.mean(other < left)) >= PREFER_MIN_RATIO:
                 return PictureVerdict(order, None, len(pairs))
+    if trajectory is not None and (later_s := _clocks_apart_s(pairs, seen, trajectory)) is not None:
+        return PictureVerdict(None, None, len(pairs), later_s)
     verdict = camera_verdict(watched)
     return None if verdict is None else PictureVerdict(None, verdict, len(pairs))
+
+
+def _clocks_apart_s(
+    pairs: Sequence["PosedPair"], seen: Sequence[SeenMotion | None], trajectory: Trajectory
+) -> float | None:
+    """How much later a trajectory turns than the pictures; None where its own times explain them, or no others do.
+
+    Only pairs that it covers at every time that is tried are looked at.
+    """
+    offsets_s = np.arange(-OFFSET_MAX_S, OFFSET_MAX_S + OFFSET_STEP_S / 2, OFFSET_STEP_S)
+    moved = {round(float(o), 3): [pair.at_another_time(trajectory, float(o)) for pair in pairs] for o in offsets_s}
+    whole = [k for k in range(len(pairs)) if all(each[k] is not None for each in moved.values())]
+    if len(whole) < OFFSET_PAIRS_MIN:
+        return None
+    left = {
+        offset_s: turn_costs(
+            motions_of([seen[k] for k in whole], [T for k in whole if (T := each[k]) is not None]), np.eye(3)
+        )
+        for offset_s, each in moved.items()
+    }
+    best_s = min(left, key=lambda offset_s: trimmed(left[offset_s]))
+    own, other = left[0.0], left[best_s]
+    explains = BETTER_MIN_RATIO * trimmed(other) < trimmed(own) and evidence(own, other) > OFFSET_EVIDENCE_MIN
+    if abs(best_s) < OFFSET_MIN_S or not explains or float(np.mean(other < own)) < PREFER_MIN_RATIO:
+        return None
+    return best_s
 
 
 def least_costs(motions: Motions) -> Float:
@@ -151,12 +197,21 @@ class PosedPair:
         T_before: (4, 4) pose of the body at the first.
         T_now: (4, 4) at the second.
         T_body_camera: (4, 4).
+        before_s: Stamp of the first picture.
+        now_s: Of the second.
     """
 
     flow: Flow
     T_before: Float
     T_now: Float
     T_body_camera: Float
+    before_s: float = 0.0
+    now_s: float = 0.0
+
+    def at_another_time(self, trajectory: Trajectory, offset_s: float) -> Float | None:
+        """(4, 4) the second camera in the first, had both been taken so much later; None where no pose is there."""
+        a, b = trajectory.at(self.before_s + offset_s), trajectory.at(self.now_s + offset_s)
+        return None if a is None or b is None else between(a @ self.T_body_camera, b @ self.T_body_camera)
 
     def shifted(self, places: int) -> Float:
         """(4, 4) the second camera in the first, had the quaternions' numbers been taken in another order."""
@@ -173,10 +228,12 @@ def reordered(T: Float, places: int) -> Float:
 
 def posed_pairs(source: Source, trajectory: Trajectory) -> list[PosedPair] | None:
     """Pairs of pictures between which the camera turns, from all over the recording; None where nothing can be seen."""
+    chosen, lens = chosen_pairs(source.images, trajectory), source.lens
+    if lens is None or not chosen:
+        return None
     registrar_of = build_perception(PerceptionConfig())
-    registrar, lens = registrar_of.registrar, source.lens
-    chosen = chosen_pairs(source.images, trajectory)
-    if lens is None or not chosen or not isinstance(registrar, SeesFlow):
+    registrar = registrar_of.registrar
+    if not isinstance(registrar, SeesFlow):
         return None
     try:
         straightener = Straightener(lens.camera, lens.view_rad)
@@ -196,7 +253,7 @@ def posed_pairs(source: Source, trajectory: Trajectory) -> list[PosedPair] | Non
         T = lens.T_body_camera
         flow = registrar.flow(a, b, T_before @ T, T_now @ T)
         if flow is not None:
-            found.append(PosedPair(flow, T_before, T_now, T))
+            found.append(PosedPair(flow, T_before, T_now, T, before[0], now[0]))
     return found
 
 

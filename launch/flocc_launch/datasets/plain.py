@@ -15,14 +15,16 @@ from flocc_agent.runtime.stamp_units import are_counted, plausible_units
 from flocc_agent.runtime.text_tables import is_number, text_lines
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
-from flocc_launch.datasets.files import camera_file, image_files, listed_images, some, unequal
+from flocc_launch.datasets.files import camera_file, camera_files, image_files, listed_images, some, unequal
 from flocc_launch.datasets.source import DatasetError, Lens, Source
 from flocc_launch.datasets.stamped_names import stamps_of_names
 
 Stamped = tuple[tuple[float, Path], ...]
 
+NAMED_ODOMETRY = ("odometry", "odom", "vio")
+"""Names of files that say that they are odometry: those count before a trajectory or poses, which may be anything."""
 ODOMETRY_STEMS = (
-    "odometry", "trajectory", "poses", "vio", "odom", "camera_poses", "arcore_poses", "arkit_poses", "arcore", "arkit",
+    *NAMED_ODOMETRY, "trajectory", "poses", "camera_poses", "arcore_poses", "arkit_poses", "arcore", "arkit",
     "arposes",
 )  # fmt: skip
 TRUTH_STEMS = ("groundtruth", "gt", "ground_truth")
@@ -32,8 +34,11 @@ IMAGE_FOLDERS = (
 )  # fmt: skip
 TIMES = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
 """Stamps of images whose names only count, one a line, or behind the image's number or before or behind its name."""
+STAMPS_APART_MAX_S = 1e-3
 OF_PHONES = ("arcore", "arkit", "arposes")
 PHONE_AXES = "T_body_camera = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]"
+BESIDE_READ = ("plain", "euroc", "kitti-raw")
+"""Data sets whose reader takes any trajectory beside them; of others only what is called odometry counts."""
 TRAJECTORY_SUFFIXES = (".tum", ".txt", ".csv")
 BY_ORDER = "the names of the images were taken to count them only: each has the stamp of the pose in the same place"
 UNUSUAL = ("dates, read as UTC", "seconds and their fraction", *(f"{name} gives them" for name in TIMES))
@@ -71,7 +76,7 @@ def read_plain(path: Path, form: str | None = None) -> Source:
     notes = (*read_how, *notes)
     return Source(
         path, "plain", images, lens, odometry=odometry, truth=truth, faults=faults, notes=notes,
-        is_posed_by_image=by_order,
+        is_posed_by_image=by_order, calibrations=tuple(camera_files(path)),
     )  # fmt: skip
 
 
@@ -98,6 +103,11 @@ def trajectories_beside(
     odometry, notes = _first_trajectory(path, ODOMETRY_STEMS, form, stamps_s)
     truth, truth_notes = _first_trajectory(path, TRUTH_STEMS, form, stamps_s)
     return odometry, truth, (*notes, *truth_notes)
+
+
+def odometry_stems(format_name: str) -> tuple[str, ...]:
+    """Names of files that are taken as odometry beside a data set of a format."""
+    return ODOMETRY_STEMS if format_name in BESIDE_READ else NAMED_ODOMETRY
 
 
 def expected_files(path: Path) -> str:
@@ -151,8 +161,10 @@ def _named_images(path: Path) -> tuple[Stamped | None, tuple[str, ...], str]:
     folder = _image_folder(path)
     files = some(tuple(image_files(folder)), folder)
     stamps_s, how = stamps_of_names([file.stem for file in files], folder)
-    if stamps_s is None and (times := next((path / t for t in TIMES if (path / t).is_file()), None)) is not None:
-        stamps_s, how = stamps_of_times(times, files), f"{times.name} gives them"
+    times = [path / name for name in TIMES if (path / name).is_file()]
+    if stamps_s is None and times:
+        stamps_s, how = stamps_of_times(times[0], files), f"{times[0].name} gives them"
+        _see_one_time(times, stamps_s, files)
     if stamps_s is None:
         return None, (), how
     pairs = sorted(zip(stamps_s, files, strict=True))
@@ -162,6 +174,24 @@ def _named_images(path: Path) -> tuple[Stamped | None, tuple[str, ...], str]:
             f"{twins[1]}: has the stamp of another image, {twins[0]:.6f} s; a folder holds the images of one camera"
         )
     return tuple(pairs), (), how
+
+
+def _see_one_time(times: Sequence[Path], stamps_s: Sequence[float], files: Sequence[Path]) -> None:
+    """See that other files of stamps that are as many say the same.
+
+    Raises:
+        DatasetError: One does not.
+    """
+    for other in times[1:]:
+        try:
+            said_s = stamps_of_times(other, files)
+        except DatasetError:  # of something else: it is told that it was not used
+            continue
+        if not np.allclose(said_s, stamps_s, rtol=0.0, atol=STAMPS_APART_MAX_S):
+            raise DatasetError(
+                f"{times[0]} and {other.name} give the images different stamps, {stamps_s[0]:.6f} s and "
+                f"{said_s[0]:.6f} s to the first: keep the one that counts"
+            )
 
 
 def stamps_of_times(path: Path, files: Sequence[Path]) -> list[float]:

@@ -19,7 +19,7 @@ from flocc_agent.runtime.text_tables import is_number, numbered_lines, read_text
 from flocc_agent.runtime.trajectory import Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.colmap_order import SEEN_MAX, contradicted, read_points, seen_in
-from flocc_launch.datasets.files import image_files, listed_file, natural
+from flocc_launch.datasets.files import camera_file, camera_files, image_files, listed_file, natural
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import size_of
 from flocc_launch.datasets.source import DatasetError, Lens, Source
@@ -40,6 +40,11 @@ FRAME_KEYS = {
     "fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model", "camera_angle_x",
 }  # fmt: skip
 """What a frame of transforms.json says that is used, or that says nothing of poses, lenses and stamps."""
+AXES_KEY = re.compile(r"conven|coord|axes|handed|world_?(to|2)_?cam|w2c|pose_?(type|format)")
+AXES_READ = re.compile(
+    r"open_?gl|blender|nerf|c2w|cam(era)?_?(to|2)_?world|(w2c|world_?(to|2)_?cam\w*) false|handed\w* right"
+)
+"""Keys of transforms.json that name a convention of its poses, and what they say of the one that is read."""
 COLMAP_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap_text")
 
 
@@ -92,10 +97,16 @@ def read_colmap(path: Path) -> Source:
         )
     if len(used) > 1:
         raise DatasetError(f"{place / 'images.txt'}: images are of {len(used)} cameras; flocc takes one")
-    lens = read_lens(place / f"cameras.txt#{next(iter(used))}")
+    own = place / f"cameras.txt#{next(iter(used))}"
+    lens = read_lens(own)
     _refuse_other_order(place, images, seen, lens)
     source = _source(path, "colmap", _image_folder(path), poses, lens)
-    return replace(source, notes=(*source.notes, *_cut_rows(file, cut, len(poses)), *_other_models(path, place)))
+    transforms = [path / "transforms.json"] if (path / "transforms.json").exists() else []
+    return replace(
+        source,
+        notes=(*source.notes, *_cut_rows(file, cut, len(poses)), *_other_models(path, place)),
+        calibrations=(own, *(each for each in camera_files(path) if each != place / "cameras.txt"), *transforms),
+    )
 
 
 def _other_models(path: Path, place: Path) -> list[str]:
@@ -212,6 +223,7 @@ def read_transforms(path: Path) -> Source:
     if wrong is not None:
         raise DatasetError(f"{file}: the transform_matrix of {wrong} is not 4x4")
     world = {name: checked_pose(T @ CAMERA_OF_OPENGL, f"{file}: {name}") for name, T in poses.items()}
+    _refuse_other_axes(table, file)
     scale = _applied_scale(table, file)
     for T in world.values():
         T[:3, 3] /= scale
@@ -220,7 +232,23 @@ def read_transforms(path: Path) -> Source:
     scaled = f"{file}: applied_scale is {scale:g}; distances are those before it, the poses' divided by it"
     unused = sorted({key for f in frames for key in f} - FRAME_KEYS)
     told = f"{file}: not used of its frames: {', '.join(unused[:12])}"
-    return replace(source, notes=(*source.notes, *([scaled] if scale != 1.0 else []), *([told] if unused else [])))
+    notes = (*source.notes, *([scaled] if scale != 1.0 else []), *([told] if unused else []))
+    return replace(source, notes=notes, calibrations=(file, *camera_files(path)))
+
+
+def _refuse_other_axes(table: dict[str, Any], file: Path) -> None:
+    """Refuse poses that the file itself says are of other axes, or of the world in the camera.
+
+    Raises:
+        DatasetError: A key that names a convention names another one than OpenGL's camera in the world.
+    """
+    for key, value in table.items():
+        text = f"{key} {value}".lower()
+        if AXES_KEY.search(key.lower()) and value not in (None, "") and not AXES_READ.search(text):
+            raise DatasetError(
+                f"{file}: {key} is {str(value)[:40]!r}, but poses are read as those of a camera in the world, in "
+                "OpenGL's axes (y up, z backwards): write them so, and take the key out"
+            )
 
 
 def _applied_scale(table: dict[str, Any], file: Path) -> float:
@@ -325,8 +353,12 @@ def read_replica(path: Path) -> Source:
     files = [file for file in image_files(path / "results") if file.stem.startswith("frame")]
     stamps_s = [k / REPLICA_RATE_HZ for k in range(len(files))]
     truth, notes = read_trajectory(path / "traj.txt", "kitti", stamps_s)
-    place = next((p for p in (path / "cam_params.json", path.parent / "cam_params.json") if p.exists()), None)
-    lens = None if place is None else read_lens(place)
-    told = f"{path}: images have no stamps; {REPLICA_RATE_HZ:g} a second were assumed"
     images = tuple(zip(stamps_s, files, strict=True))
-    return Source(path, "replica", images, lens, truth=truth, notes=(told, *notes), is_posed_by_image=True)
+    place = next((p for p in (path / "cam_params.json", path.parent / "cam_params.json") if p.exists()), None)
+    lens = camera_file(path, images) if place is None else read_lens(place)
+    calibrations = (*([] if place is None else [place]), *camera_files(path))
+    told = f"{path}: images have no stamps; {REPLICA_RATE_HZ:g} a second were assumed"
+    return Source(
+        path, "replica", images, lens, truth=truth, notes=(told, *notes), is_posed_by_image=True,
+        calibrations=calibrations,
+    )  # fmt: skip

@@ -53,6 +53,7 @@ class Source:
         notes: What was left out, or concluded where nothing said it; one sentence each.
         levels: How images of 16 bits are brought to 8.
         is_posed_by_image: Whether each image has a pose of its own, and stamps are only numbers of both.
+        calibrations: Files of the folder that describe its camera; the first of them is taken.
     """
 
     path: Path
@@ -66,3 +67,4 @@ class Source:
     notes: tuple[str, ...] = ()
     levels: Levels = FULL
     is_posed_by_image: bool = False
+    calibrations: tuple[Path, ...] = ()

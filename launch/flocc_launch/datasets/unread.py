@@ -9,15 +9,28 @@ from pathlib import Path
 from flocc_agent.runtime.measurement_file import NAME as MEASUREMENTS
 from flocc_agent.runtime.recording import MASK
 from flocc_launch.datasets.files import camera_files
-from flocc_launch.datasets.plain import LISTINGS, ODOMETRY_STEMS, TIMES, TRUTH_STEMS, trajectory_files
+from flocc_launch.datasets.plain import (
+    BESIDE_READ,
+    LISTINGS,
+    ODOMETRY_STEMS,
+    TIMES,
+    TRUTH_STEMS,
+    odometry_stems,
+    trajectory_files,
+)
 from flocc_launch.datasets.source import Source
 
-USED_NAMES = re.compile(
-    r"(odometry|trajectory|poses|vio|groundtruth|gt|ground_truth|traj|images|rgb|times|source|odometry_made)"
-    r"\.(tum|txt|csv)$|state_groundtruth|mocap0|camera|calib|intrinsics|sensor|transforms\.json$|sparse$|frame-",
-    re.IGNORECASE,
-)
-"""Names of what readers of published data sets use beside images."""
+OWN_NAMES = {
+    "euroc": r"state_groundtruth|mocap0|gt0|vicon0|cam0$|dso$|mav0$",
+    "kitti": r"times\.txt$|poses\.txt$|image_[0-3lr]$",
+    "kitti-raw": r"image_0[0-3]$|calib_cam_to_cam\.txt$|oxts$",
+    "7scenes": r"frame-",
+    "tum": r"rgb\.txt$|groundtruth\.txt$",
+    "colmap": r"sparse$|colmap|cameras\.txt$|images\.txt$|points3D\.txt$|(rigs|frames)\.txt$",
+    "transforms": r"transforms\.json$",
+    "replica": r"results$|traj\.txt$",
+}
+"""By format, names of what its reader uses of a data set, or tells of by itself."""
 OF_RECORDINGS = (MASK, MEASUREMENTS, "source.txt", "odometry_made.txt")
 SHOWN_MAX = 8
 
@@ -29,15 +42,24 @@ def unused(source: Source, *given: Path | None) -> tuple[str, ...]:
         source: As it was read.
         given: Files that are used because a person named them.
     """
-    root = source.path / "mav0" if (source.path / "mav0").is_dir() else source.path
+    root, mav = source.path, source.path / "mav0"
     used = {file.relative_to(root).parts[0] for _, file in source.images if file.is_relative_to(root)}
     used |= {file.name for file in given if file is not None and file.parent.resolve() == root.resolve()}
-    entries = [entry.name for entry in sorted(root.iterdir()) if entry.name[0] != "." and entry.name not in used]
+    used |= set(OF_RECORDINGS) | {
+        file.relative_to(root).parts[0].partition("#")[0] for file in source.calibrations if root in file.parents
+    }
     if source.format == "plain":
-        taken = _taken_by_plain(root)
-        others = [name for name in entries if name not in taken]
+        used |= _taken_by_plain(root)
     else:
-        others = [name for name in entries if name not in OF_RECORDINGS and not USED_NAMES.match(name)]
+        own = re.compile(OWN_NAMES[source.format])
+        stems = (*odometry_stems(source.format), *(TRUTH_STEMS if source.format in BESIDE_READ else ()))
+        used |= {file.name for file in trajectory_files(root, stems)}
+        used |= {
+            entry.name for place in (root, mav) if place.is_dir() for entry in place.iterdir() if own.match(entry.name)
+        }
+    inside = mav.iterdir() if mav.is_dir() else ()
+    entries = sorted(dict.fromkeys(entry.name for entry in (*root.iterdir(), *inside)))
+    others = [name for name in entries if name[0] != "." and name not in used]
     more = f" and {len(others) - SHOWN_MAX} more" if len(others) > SHOWN_MAX else ""
     return (f"{root}: not used: {', '.join(others[:SHOWN_MAX])}{more}",) if others else ()
 

@@ -17,6 +17,7 @@ from flocc_launch.datasets.files import camera_file, camera_files
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import JPEG_QUALITY, ImageWriter
 from flocc_launch.datasets.plain import ODOMETRY_STEMS, TRAJECTORY_SUFFIXES
+from flocc_launch.datasets.said_twice import see_one_trajectory
 from flocc_launch.datasets.source import DatasetError, Lens
 from flocc_launch.datasets.writer import Progress, RecordingWriter
 
@@ -77,10 +78,37 @@ def _opened(path: Path) -> Iterator[Any]:
 
 def odometry_beside(path: Path) -> Path | None:
     """The trajectory of a video: of its own name, or one of the plain names where it is its folder's only video."""
+    return next(iter(trajectories_beside_video(path)), None)
+
+
+def trajectories_beside_video(path: Path) -> list[Path]:
+    """Files that may be a video's trajectory, in the order in which they count."""
     alone = sum(is_video(entry) for entry in path.parent.iterdir()) == 1
     stems = (path.stem, *(ODOMETRY_STEMS if alone else ()))
-    names = [f"{stem}{suffix}" for stem in stems for suffix in TRAJECTORY_SUFFIXES]
-    return next((path.parent / name for name in names if (path.parent / name).is_file()), None)
+    names = dict.fromkeys(f"{stem}{suffix}" for stem in stems for suffix in TRAJECTORY_SUFFIXES)
+    return [path.parent / name for name in names if (path.parent / name).is_file()]
+
+
+def beside_notes(
+    path: Path, camera: Path | None = None, odometry: Path | None = None, form: str | None = None
+) -> list[str]:
+    """What lies beside a video and is not read: a second trajectory, stamps of its frames, its GPS.
+
+    Raises:
+        DatasetError: Two trajectories under one name tell different motions, and none was named.
+    """
+    trajectories = trajectories_beside_video(path)
+    if odometry is None and len(trajectories) > 1:
+        see_one_trajectory(read_trajectory(trajectories[0], form)[0], trajectories, form, [])
+    read = {*files_beside(path), path, camera, odometry}
+    stem = path.stem.lower()
+    left = [
+        file.name
+        for file in sorted(path.parent.iterdir())
+        if file not in read
+        and (file in trajectories or (file.name.lower().startswith(stem) and not file.name[len(stem) :][:1].isalnum()))
+    ]
+    return [f"{path}: not used: {', '.join(left[:8])}"] if left else []
 
 
 def files_beside(path: Path) -> list[Path]:
@@ -138,6 +166,7 @@ def convert_video(
         raise DatasetError(f"{path}: intrinsics are missing; name a camera file with --camera")
     lens = replace(lens, view_rad=view_rad) if view_rad is not None else lens
     trajectory, notes = read_trajectory(file, form)
+    notes = (*notes, *beside_notes(path, camera, odometry, form))
     faults = video_faults(path, file, trajectory, lens, head)
     if faults:
         raise DatasetError(faults[0])

@@ -13,7 +13,8 @@ HARMLESS = frozenset({"overlay"})
 
 AXES = (
     "The axes seem to be another convention's: T_body_camera is missing, or odometry is of the body (x forward, z up) "
-    "where the camera's is meant (z forward), or the camera hangs upside down."
+    "where the camera's is meant (z forward), or the camera hangs upside down; who moves in a plane sees mirrored "
+    "pictures (selfie mode, a flip in the driver) as such a one does."
 )
 KEPT_OUT = "As long as its pictures say so its keyframes are kept out of closures."
 ADVICE = {
@@ -33,7 +34,10 @@ ADVICE = {
         "It was left out once it was found; a mask.png in the robot's folder, as large as the images and black where "
         "they show it, leaves it out from the first."
     ),
-    "frozen": "They were not used. Look at the camera, its cable and its driver.",
+    "frozen": (
+        "They were not used. Look at the camera, its cable and its driver. Only where pictures have no noise, in a "
+        "simulator, does a robot that stands still see the very same."
+    ),
     "standing": (
         "They were not used. Look at what drives it and at odometry: wheels that slip or are blocked turn on. If it "
         "did move, look at the camera's stream, which then repeats a picture and codes it anew."

@@ -1,7 +1,7 @@
 """A camera that does not fit is found from its own keyframes, and one that fits is left in peace."""
 
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import cast
 
@@ -86,6 +86,19 @@ def turned_by(T_body_camera: Float) -> Callable[[list[Float]], list[Float]]:
     return lambda poses: [T @ inverse(T_body_camera) for T in poses]
 
 
+def as_a_car_knows(seed: int, times: float = 1.0) -> Callable[[list[Float]], list[Float]]:
+    """Odometry that is off by so many times 2 degrees of heading and 3 cm from one keyframe to the next."""
+    rng = np.random.default_rng(seed)
+    turn_rad, t_m = times * np.radians([0.6, 2.0, 0.6]), times * 0.03
+
+    def known(poses: list[Float]) -> list[Float]:
+        steps = [inverse(before) @ now for before, now in pairwise(poses)]
+        off = [pose(so3_exp(rng.normal(0.0, turn_rad)), rng.normal(0.0, t_m, 3)) for _ in steps]
+        return list(accumulate((T @ error for T, error in zip(steps, off, strict=True)), np.matmul, initial=poses[0]))
+
+    return known
+
+
 def _rays(T_world_before: Float, T_world_now: Float, rng: np.random.Generator) -> tuple[Float, Float]:
     """Matches of points before both cameras, half a pixel wrong."""
     points = np.column_stack([rng.uniform(-6, 6, 400), rng.uniform(-3, 3, 400), rng.uniform(3, 25, 400)])
@@ -147,6 +160,39 @@ def test_mirrored_pictures_are_named() -> None:
     verdict = camera_verdict(flows(np.random.default_rng(4), mirrored=True))
     assert verdict is not None
     assert verdict.fault is CameraFault.MIRRORED
+
+
+def test_other_axes_are_named_also_where_odometry_is_too_bad_for_anything_else() -> None:
+    """Nothing makes bad odometry agree with pictures, but the axes that are configured leave twice as much and more.
+
+    In a plane a mirrored camera moves as one that hangs upside down does.
+    """
+    rng, car = np.random.default_rng, as_a_car_knows(0)
+    upside_down = turned_by(pose(so3_exp(np.array([0.0, 0.0, np.pi])), np.zeros(3)))
+    pairs = flows(rng(0), 12, mirrored=True, odometry=car)
+    found = [
+        camera_verdict(flows(rng(0), 12, odometry=car)),
+        camera_verdict(pairs),
+        camera_verdict(flows(rng(0), 12, odometry=lambda poses: upside_down(car(poses)))),
+    ]
+    assert [None if verdict is None else verdict.fault for verdict in found] == [
+        None,
+        CameraFault.MOUNTING,
+        CameraFault.MOUNTING,
+    ]
+    assert all(verdict.places_wrongly for verdict in found if verdict is not None)
+
+
+def test_axes_that_were_found_wrong_stay_so_as_long_as_they_explain_more() -> None:
+    pairs = flows(np.random.default_rng(1), 10, mirrored=True, odometry=as_a_car_knows(1, 2.2))
+    first = camera_verdict(pairs[:5])
+    assert first is not None
+    assert camera_verdict(pairs) is None
+    for fault in (first.fault, CameraFault.MIRRORED):
+        later = camera_verdict(pairs, fault)
+        assert later is not None
+        assert later.fault is fault
+        assert later.places_wrongly
 
 
 def test_a_robot_that_only_drives_straight_shows_no_focal_length() -> None:

@@ -224,3 +224,17 @@ def test_a_recording_of_twelve_bits_is_not_black(tmp_path: Path) -> None:
     recording = Recording.open(tmp_path)
     pixels = recording.load_image(recording.frames[2]).pixels
     np.testing.assert_array_equal(pixels[..., 0], (deep >> 4).astype(np.uint8))
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_a_tiff_whose_0_is_white_is_shown_as_it_says(kind: type[np.unsignedinteger[Any]]) -> None:
+    full = int(np.iinfo(kind).max)
+    encoded = pil(full - GREY.astype(kind) * (full // 255), "TIFF", tiffinfo={262: 0})
+    np.testing.assert_array_equal(read_picture(encoded)[..., 0], GREY)
+
+
+def test_a_tiff_of_colours_that_are_not_to_be_shown_as_they_are_is_refused() -> None:
+    out = io.BytesIO()
+    PIL.new("LAB", (WIDTH, HEIGHT)).save(out, "TIFF")
+    with pytest.raises(PictureError, match=r"is a TIFF of CIE L\*a\*b\*, which flocc does not read"):
+        read_picture(out.getvalue())

@@ -71,6 +71,25 @@ def test_rows_that_cannot_be_are_left_out_and_counted(
     assert any(note in each and f"{len(places)} of 20" in each for each in notes), notes
 
 
+@pytest.mark.parametrize("places", [(9,), (9, 10), (5, 6, 17)])
+def test_poses_that_a_lost_program_wrote_at_the_origin_are_left_out(tmp_path: Path, places: tuple[int, ...]) -> None:
+    """A robot that stands at its origin at first, or comes back to it in its own steps, keeps those poses."""
+    xs = [0.0, 0.0, *(0.5 * k for k in range(1, 19)), *(9.0 - 0.5 * k for k in range(1, 19))]
+    wrong = [0.0 if k in places else x for k, x in enumerate(xs)]
+    (tmp_path / "odometry.tum").write_text("".join(line(0.1 * k, at_m(x)) for k, x in enumerate(wrong)))
+    trajectory, notes = read_trajectory(tmp_path / "odometry.tum")
+    assert trajectory.T_fixed_body[:, 0, 3].tolist() == [x for k, x in enumerate(xs) if k not in places]
+    assert any(f"{len(places)} of 38 poses are exactly at the origin and not turned" in note for note in notes)
+
+
+def test_a_robot_that_is_back_at_its_origin_is_not_lost(tmp_path: Path) -> None:
+    xs = [0.0, *(0.5 * k for k in range(1, 10)), *(4.5 - 0.5 * k for k in range(1, 10)), *(0.5 * k for k in range(9))]
+    (tmp_path / "odometry.tum").write_text("".join(line(0.1 * k, at_m(x)) for k, x in enumerate(xs)))
+    trajectory, notes = read_trajectory(tmp_path / "odometry.tum")
+    assert len(trajectory) == len(xs)
+    assert not any("left out" in note for note in notes)
+
+
 def test_a_trajectory_faster_than_any_robot_is_refused_with_a_question(tmp_path: Path) -> None:
     (tmp_path / "odometry.tum").write_text("".join(line(0.1 * k, at_m(1e3 * k)) for k in range(20)))
     with pytest.raises(RecordingError, match="in metres"):

@@ -180,6 +180,21 @@ REFUSED = {
         "# T_body_world: timestamp tx ty tz qx qy qz qw\n" + GOOD,
         "turned.tum:1: .*in the body.*t_body_world",
     ),
+    "global.tum": (
+        "# frame_T_global: timestamp tx ty tz qx qy qz qw\n" + GOOD,
+        "global.tum:1: .*in the body or camera .frame_t_global",
+    ),
+    "anew.csv": (
+        "time,x,y,z,qx,qy,qz,qw\n"
+        + GOOD.replace(" ", ",")
+        + "time,x,y,z,qw,qx,qy,qz\n"
+        + GOOD.replace(" ", ",").replace("\n1", "\n2"),
+        "anew.csv:12: names other columns than those of the rows before it .*cut it",
+    ),
+    "anew.txt": (
+        "# time x y z qx qy qz qw\n" + GOOD + "# time x y z qw qx qy qz\n" + GOOD.splitlines()[-1] + "\n",
+        "anew.txt:12: names other columns than those of the rows before it",
+    ),
     "w2c.tum": ("# poses are world-to-camera\n" + GOOD, "w2c.tum:1: .*in the body or camera .world_to_camera"),
     "jpl.tum": ("# timestamp tx ty tz qx qy qz qw (JPL)\n" + GOOD, "jpl.tum:1: the quaternions are said to be JPL's"),
     "w2c_above.tum": (

@@ -84,7 +84,7 @@ class CameraWatch:
         self._seen = 0
         self._repeats = Counter[Repeat]()
         self._told: list[CameraDoubted] = []
-        self._withheld = False
+        self._withheld: CameraFault | None = None
         self._looked = 0
 
     def look(self, perception: Perception, image: Image, T_odom_camera: Float) -> KeyframeLook:
@@ -96,7 +96,7 @@ class CameraWatch:
             T_odom_camera: (4, 4) by odometry, metres.
         """
         doubts = []
-        earlier, was_withheld = min(self._looked, WITHDRAWN_MAX), self._withheld
+        earlier, was_withheld = min(self._looked, WITHDRAWN_MAX), self._withheld is not None
         self._looked += 1
         if isinstance(perception.registrar, SeesFlow):
             with stage("watch"):
@@ -113,7 +113,7 @@ class CameraWatch:
         if isinstance(perception.registrar, SeesFlow):
             with stage("watch"):
                 doubts += self._motion(perception.registrar, latent, T_odom_camera)
-        if self._withheld:
+        if self._withheld is not None:
             return KeyframeLook(None, None, WITHHELD, tuple(doubts), withdrawn=0 if was_withheld else earlier)
         hidden = image.hidden if told else None
         return KeyframeLook(descriptor, latent, "", tuple(doubts), hidden, 0 if hidden is None else earlier)
@@ -170,8 +170,8 @@ class CameraWatch:
         is_time = count in JUDGED_AT if self._seen <= PAIRS_MAX else self._seen % EVERY_LATER**2 == 0
         if not is_time or not shows_camera(self._pairs):
             return []
-        verdict = camera_verdict(self._pairs)
-        self._withheld = verdict is not None and verdict.places_wrongly
+        verdict = camera_verdict(self._pairs, self._withheld)
+        self._withheld = verdict.fault if verdict is not None and verdict.places_wrongly else None
         return [] if verdict is None else self._judged(verdict)
 
     def _judged(self, verdict: CameraVerdict) -> list[CameraDoubted]:

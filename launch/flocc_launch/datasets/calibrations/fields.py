@@ -78,6 +78,8 @@ _MATTERS = re.compile(
     r"prism|mount|^rpy|^ypr|^xyz|^pos$|^roll|^pitch|^yaw|euler|orient|position|quat|^tilt|^pan$|ext[rt]$|^rc[li]$|^pc[li]$|pose|zoom|scale|resiz|^f$|^fl|^f[xyuv]|^c[xyuv]$|matrix|tocam|camto|principal|center|centre|affine|shear"
 )
 """Plain names of keys that say something about a camera; one that is not understood is refused."""
+PLACED = re.compile(r"xyz|rpy|ypr|translation|rotation|position|orientation|quaternion|euler(angles)?")
+"""Plain names in a map that says where something sits, as URDF's `origin: {xyz: 0.1 0 0.3, rpy: 0 0 0}`."""
 POSE_NUMBERS = (3, 6, 7, 9, 12, 16)
 BOUNDS = 6
 """Numbers of a box: in settings beside the camera, as many are more often that than a position and angles."""
@@ -126,6 +128,8 @@ def _matters(key: str, value: Any) -> bool:
     name = plain(key)
     if isinstance(value, str) and kind_of(value) not in (None, LensKind.PINHOLE):
         return True
+    if re.search(r"pixel(aspect|ratio)", name):
+        return value not in (1, "1", "1.0")
     if isinstance(value, str) and re.search(r"units?$", name):
         return plain(value) not in HARMLESS_UNITS
     if isinstance(value, str) and not re.search(r"model|type|distort|lens|fisheye", name):
@@ -143,8 +147,13 @@ def _could_be_a_pose(value: Any) -> bool:
     """Whether a value is as many numbers as a position or a rotation or both, names their axes, or holds such a one."""
     if isinstance(value, dict):
         named = {"x", "y", "z"} <= set(value) or {"roll", "pitch", "yaw"} <= set(value)
-        return named or any(
-            _count(each) != BOUNDS and _could_be_a_pose(each) and not _says_nothing(each) for each in value.values()
+        placed = any(PLACED.fullmatch(plain(key)) and not _says_nothing(each) for key, each in value.items())
+        return (
+            named
+            or placed
+            or any(
+                _count(each) != BOUNDS and _could_be_a_pose(each) and not _says_nothing(each) for each in value.values()
+            )
         )
     return _count(value) in POSE_NUMBERS
 
