@@ -20,6 +20,7 @@ from flocc_agent.core.reports import Fact
 from flocc_agent.core.robot import Robot
 from flocc_agent.perception.backends import build_perception
 from flocc_agent.radio import Radio
+from flocc_agent.runtime.certificate_faults import check_certificate
 from flocc_agent.runtime.driver import Driver
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.jobs import Tools
@@ -30,7 +31,7 @@ from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import Reporter, result_of
 from flocc_agent.runtime.robot_result import RobotResult
-from flocc_agent.runtime.security import RecordSealer
+from flocc_agent.runtime.security import RecordSealer, check_member
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.workers import Workers
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
@@ -96,10 +97,11 @@ def compose(
         new_journey: The odometry began anew since the last start.
 
     Raises:
-        FloccError: The map, the store or a checkpoint cannot be used.
+        FloccError: The map, the keys, the store or a checkpoint cannot be used.
     """
     opened = None if config.map is None else MapFolder.open(config.map)
     perception = sight.perception or build_perception(config.perception, config.seed)
+    sealer = _sealer(config)  # before a store is begun: by keys of another robot nothing is written
     store = _open_store(config)
     try:
         if new_journey:
@@ -109,7 +111,6 @@ def compose(
             _use_map(store, opened, config, sight, perception, map_fixed)
         workers = Workers()
         radio = Radio(config.radio.parameters(), np.random.default_rng([config.seed, zlib.crc32(config.name.encode())]))
-        sealer = _sealer(config)
         core = Robot(
             store.identity.log,
             _compute_class(config, sealer),
@@ -187,7 +188,14 @@ def stored_result(config: AgentConfig) -> RobotResult:
 
 
 def _sealer(config: AgentConfig) -> RecordSealer | None:
-    return None if config.transport.tls is None else RecordSealer.of(config.transport.tls, config.name)
+    """What signs for this robot, once its keys are known to be its own, of its swarm, and whole."""
+    tls = config.transport.tls
+    if tls is None:
+        return None
+    sealer = RecordSealer.of(tls, config.name)
+    check_member(tls, config.swarm, config.name)
+    check_certificate(tls, config.name)
+    return sealer
 
 
 def _compute_class(config: AgentConfig, sealer: RecordSealer | None) -> int:

@@ -55,8 +55,7 @@ def scale(robots: int, minutes: float, area_m: float = 120.0, closures_enough: i
     """A large swarm in a town, radio range 25 m: CPU time of the simulation on one core, bytes by kind, memory."""
     scenario = town(robots, area_m, minutes)
     if closures_enough is not None:
-        closing = replace(scenario.core.loop_closing, closures_enough=closures_enough)
-        scenario = scenario.model_copy(update={"core": replace(scenario.core, loop_closing=closing)})
+        scenario = with_enough(scenario, closures_enough)
     began_s = time.process_time()
     playbacks = playbacks_of(scenario, {})
     drawn_s = time.process_time()
@@ -92,6 +91,12 @@ def town(robots: int, area_m: float, minutes: float, seed: int = 3) -> Scenario:
     scenario = _scenario(robots=robots, area_m=area_m, length_m=42.0 * minutes, range_m=25.0, distance_m=2.0)
     assert scenario.tracks is not None
     return scenario.model_copy(update={"tracks": scenario.tracks.model_copy(update={"seed": seed})})
+
+
+def with_enough(scenario: Scenario, closures_enough: int) -> Scenario:
+    """The same, where pairs are spared beside so many that agree, however small the team is; 0: none is."""
+    closing = replace(scenario.core.loop_closing, closures_enough=closures_enough, sparing_logs_min=0)
+    return scenario.model_copy(update={"core": replace(scenario.core, loop_closing=closing)})
 
 
 def twice(seeds: int) -> dict[str, Any]:
@@ -151,7 +156,11 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=50)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--area-m", type=float, default=120.0)
-    parser.add_argument("--closures-enough", type=int, help="agreeing closures of two stretches; 0: register all pairs")
+    parser.add_argument(
+        "--closures-enough",
+        type=int,
+        help="agreeing ways between two stretches, however small the team; 0: register all pairs",
+    )
     parser.add_argument("--seeds", type=int, default=200)
     given = parser.parse_args()
     match given.what:

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import shutil
 import stat
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -101,6 +102,64 @@ def test_a_certificate_that_expired_or_is_not_valid_yet_is_said(tmp_path: Path) 
     early = [*certificate_faults(tls, made - timedelta(days=400))]
     assert early[0] == f"{path}: is valid from 2019-12-31 on, and the clock says 2018-11-27; nobody is heard"
     assert network_faults(TransportConfig(tls=tls), "r1")[0].startswith(f"{path}: expired on")
+
+
+@pytest.mark.parametrize(
+    ("file", "of", "sentence"),
+    [
+        ("ca.crt", "other/r1", "robot.crt: was not made by the authority of .*ca.crt, so that nobody accepts it"),
+        ("robot.crt", "keys/r2", "robot.crt: is of r2, and this robot is named r1; its keys are in another folder"),
+        ("robot.key", "keys/r2", "robot.key: is not the key of .*robot.crt"),
+        ("robot.crt", "keys/r1/robot.key", "robot.crt: is no certificate"),
+        ("signing.key", "keys/r2", "signing.key: is the key of robot r2, and this robot is named r1"),
+        ("members.json", "farm/r1", "signing.key: is the key of no member of the swarm|is of swarm farm, not of field"),
+    ],
+)
+async def test_keys_that_do_not_belong_together_are_refused_before_anything_is_written(
+    tmp_path: Path, file: str, of: str, sentence: str
+) -> None:
+    """With such a certificate zenoh opens, nobody hears the robot, and it would lead itself for ever."""
+    for name, swarm in (("keys", SWARM), ("other", SWARM), ("farm", "farm")):
+        make_keys(tmp_path / name, swarm, ["r1", "r2"])
+    tls = TlsConfig(folder=tmp_path / "keys/r1")
+    source = tmp_path / of
+    (tls.folder / file).write_bytes((source if source.is_file() else source / file).read_bytes())
+    config = AgentConfig(name="r1", swarm=SWARM, folder=tmp_path / "r1", transport=TransportConfig(tls=tls))
+    with pytest.raises(TransportError, match=sentence):
+        await Agent(config).__aenter__()
+    assert not (tmp_path / "r1").exists()
+    if file == "ca.crt":
+        assert next(certificate_faults(tls)).startswith(f"{tls.folder / 'robot.crt'}: was not made by")
+
+
+@pytest.mark.parametrize("lost", ["authority/ca.key", "authority/ca.crt", "authority"])
+def test_a_lost_authority_is_said_and_no_other_one_put_in_its_place(tmp_path: Path, lost: str) -> None:
+    make_keys(tmp_path, SWARM, ["r1"])
+    shutil.rmtree(tmp_path / lost) if lost == "authority" else (tmp_path / lost).unlink()
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(KeysError, match=r"ca\.(key|crt): is gone, and the certificates beside it rest on it"):
+        make_keys(tmp_path, SWARM, ["r2"])
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    "written", ["{", "[]", '{"swarm": "field"}', '{"swarm": "field", "robots": 3, "operators": []}']
+)
+def test_a_list_of_members_that_a_hand_broke_is_said(tmp_path: Path, written: str) -> None:
+    make_keys(tmp_path, SWARM, ["r1"])
+    (tmp_path / "authority/members.json").write_text(written)
+    told = CliRunner().invoke(app, ["keys", str(tmp_path), "r2", "--swarm", SWARM])
+    assert isinstance(told.exception, KeysError), told.output
+    assert "members.json: is not a list of members: " in str(told.exception)
+
+
+def test_a_member_whose_folder_went_to_its_robot_keeps_the_key_by_which_others_know_it(tmp_path: Path) -> None:
+    make_keys(tmp_path, SWARM, ["r1"])
+    shutil.rmtree(tmp_path / "r1")
+    with pytest.raises(KeysError, match=r"signing.key: is not the key by which .*members.json knows r1"):
+        make_keys(tmp_path, SWARM, ["r1", "r2"])
+    assert not (tmp_path / "r2").exists()
+    assert list(make_keys(tmp_path, SWARM, ["r2"])) == ["operator", "r1", "r2"]
 
 
 def test_one_folder_is_of_one_swarm(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.clocks import fit_clocks
 from flocc_launch.datasets.commands import clock, convert
-from flocc_launch.datasets.source import DatasetError
+from flocc_launch.datasets.source import DatasetError, Source
+from flocc_launch.datasets.truth_clock import offset_s, truth_faults, turning_stretch
 
 Float = NDArray[np.float64]
 
@@ -56,6 +57,29 @@ def test_a_drift_is_found() -> None:
     fit = fit_clocks(stamps_s * 1.002, seen(own, stamps_s), own)
     assert fit is not None
     assert fit.drift_ratio == pytest.approx(0.002, rel=0.3)
+
+
+@pytest.mark.parametrize("late_s", [-3.0, -0.4, 0.0, 0.1, 0.5, 2.0])
+def test_a_trajectory_that_is_late_is_told_by_the_stretch_in_which_it_turns_most(late_s: float) -> None:
+    own = turning(60.0)
+    stamps_s = np.arange(5.0, 55.0, 0.2)
+    stretch = turning_stretch(stamps_s, own)
+    assert stretch is not None
+    assert stretch.stop - stretch.start == 60
+    turns_rad = seen(own, stamps_s)[stretch.start : stretch.stop - 1]
+    late = Trajectory(own.stamps_s + late_s, own.T_fixed_body)
+    told = offset_s(stamps_s[stretch], turns_rad, late)
+    assert told == (None if abs(late_s) < 0.2 else pytest.approx(-late_s, abs=0.04))
+
+
+@pytest.mark.parametrize("late_s", [0.0, 1.5])
+def test_ground_truth_of_another_clock_is_told_before_anything_is_measured_against_it(late_s: float) -> None:
+    own = turning(60.0)
+    bent = own.T_fixed_body @ pose(so3_exp(np.array([0.02, 0.0, 0.1])), np.array([0.5, 0.0, 0.0]))
+    truth = Trajectory(own.stamps_s + late_s, bent)
+    source = Source(Path("field"), "plain", tuple((k / 5, Path(f"{k}.jpg")) for k in range(300)), None, own, truth)
+    sentence = "field: the ground truth turns 1.50 s too late for the odometry: one of them is of another clock"
+    assert [told.startswith(sentence) for told in truth_faults(source, own)] == ([True] if late_s else [])
 
 
 def test_an_even_turn_does_not_tell() -> None:

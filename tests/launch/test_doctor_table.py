@@ -9,6 +9,7 @@ import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from tests.launch.test_doctor import PAIR, SETUPS, Story, closures_not_connectin
 from tests.launch.test_ground_truth import lifted, truth_of
 from tests.launch.test_status import apart, pair, row
 
-from flocc_agent.config import PerceptionConfig, TransportConfig
+from flocc_agent.config import PerceptionConfig, TlsConfig, TransportConfig
 from flocc_agent.core.reports import CAME_APART
 from flocc_agent.core.tentative_joins import SECOND_PLACE
 from flocc_agent.geometry import pose_from_tq, so3_exp, tq_from_pose
@@ -31,6 +32,7 @@ from flocc_launch.doctor import Finding, Severity, cameras, diagnose, installati
 from flocc_launch.doctor.live import diagnose_live
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.setup import cache
+from flocc_launch.setup.credentials import make_keys
 
 PAGE = Path(__file__).parents[2] / "docs/doctor.md"
 HELD_CLOSURE = f"closure r1/3 - r2/5: {SECOND_PLACE}of 5 places where r1 and r2 would be side by side 3 do not match"
@@ -274,6 +276,10 @@ def of_a_machine(each: Row, path: Path, patch: pytest.MonkeyPatch) -> list[Findi
         case "port":
             patch.setattr(network_check, "port_problem", lambda host, port: None if well else "Address in use")
             return network_check.ports(TransportConfig(control_listen=("tcp/127.0.0.1:7447",)))
+        case "certificate":
+            made = datetime(2020, 1, 1, tzinfo=UTC)
+            tls = TlsConfig(folder=make_keys(path, "yard", ["r1"], now=made)["r1"])
+            return network_check.configured_network(TransportConfig(tls=tls))
         case "network":
             return network_check.configured_network(no_config)
         case _:
@@ -300,10 +306,14 @@ def test_every_row_can_be_brought_about(each: Row, tmp_path: Path, monkeypatch: 
 def test_every_page_that_advice_names_holds_what_it_is_named_for() -> None:
     sources = "".join(path.read_text(encoding="utf-8") for path in Path(doctor.__path__[0]).glob("*.py"))
     pages = set(re.findall(r"docs/[\w-]+\.md", sources))
-    assert pages == {"docs/back-end.md"}
-    text = (PAGE.parents[1] / "docs/back-end.md").read_text(encoding="utf-8").lower()
-    assert "warnings" in text
-    assert "scale" in text
+    promised = {
+        "docs/back-end.md": ("warnings", "scale"),
+        "docs/measurements.md": ("## the kinds", "quaternion w x y z"),
+    }
+    assert pages == set(promised)
+    for page, words in promised.items():
+        text = (PAGE.parents[1] / page).read_text(encoding="utf-8").lower()
+        assert [word for word in words if word not in text] == []
 
 
 @pytest.mark.parametrize(("refused", "used", "told"), [(7, 5, True), (6, 6, False), (3, 0, False), (4, 3, True)])

@@ -21,8 +21,10 @@ def held(path: Path, scenario: str | None) -> Path:
 
 
 def taken(path: Path) -> RunFolder:
+    """The folder for a run of `town` that begins."""
     with fresh.fresh_folder(path, "town") as folder:
         assert folder.path == path
+        (path / "run.json").write_text(json.dumps({"scenario": "town"}))
     return folder
 
 
@@ -38,9 +40,45 @@ def test_any_other_run_is_kept_beside_it_and_said(
 ) -> None:
     with caplog.at_level(logging.WARNING):
         taken(held(tmp_path / "run", earlier))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "run.before"]
     assert (tmp_path / "run.before/robots/r1/store").read_text() == "a mission"
     assert list((tmp_path / "run/robots").iterdir()) == []
     assert f"held a run of {earlier or 'no known scenario'}, which is kept as {tmp_path / 'run.before'}" in caplog.text
+
+
+@pytest.mark.parametrize("earlier", ["town", "field", None])
+def test_a_start_that_fails_leaves_the_earlier_run_where_it_was_and_what_is_kept_of_others(
+    tmp_path: Path, earlier: str | None
+) -> None:
+    held(tmp_path / "run", earlier)
+    (held(tmp_path / "run.before", "yard") / "robots/r1/store").write_text("an older mission")
+    for _ in range(2):
+        with pytest.raises(FileExistsError), fresh.fresh_folder(tmp_path / "run", "town") as folder:
+            (folder.path / "robots").mkdir()
+    assert (tmp_path / "run/robots/r1/store").read_text() == "a mission"
+    assert (tmp_path / "run.before/robots/r1/store").read_text() == "an older mission"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "run.before"]
+
+
+@pytest.mark.parametrize("began", [False, True])
+def test_a_driver_that_was_killed_lost_no_earlier_run(tmp_path: Path, began: bool) -> None:
+    """What it leaves: the earlier run aside, and an empty folder or a run that began."""
+    (held(tmp_path / "run.earlier", "yard") / "robots/r1/store").write_text("an older mission")
+    run = tmp_path / "run"
+    (run / "robots").mkdir(parents=True)
+    (run / "lock").touch()
+    if began:
+        (run / "run.json").write_text(json.dumps({"scenario": "town"}))
+    taken(run)
+    assert (tmp_path / "run.before/robots/r1/store").read_text() == "an older mission"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "run.before"]
+
+
+def test_empty_remains_put_nothing_out_of_its_place(tmp_path: Path) -> None:
+    held(tmp_path / "run.before", "yard")
+    (tmp_path / "run/robots/r1").mkdir(parents=True)
+    taken(tmp_path / "run")
+    assert (tmp_path / "run.before/robots/r1/store").read_text() == "a mission"
 
 
 def test_what_is_no_run_is_left_alone(tmp_path: Path) -> None:

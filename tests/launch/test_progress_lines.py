@@ -31,6 +31,20 @@ def test_a_slow_start_does_not_make_the_estimate_long(capsys: pytest.CaptureFixt
     ]
 
 
+def test_the_next_robots_pictures_are_counted_anew(capsys: pytest.CaptureFixture[str]) -> None:
+    now_s = 0.0
+    lines = ProgressLines("preparing data", "picture", lambda: now_s)
+    for _ in range(2):
+        now_s += 20.0  # the pictures are held against the trajectory first
+        for done in range(1, 11):
+            lines.tell(done, 10)
+            now_s += 1.0
+    assert capsys.readouterr().err.splitlines() == [
+        "preparing data: picture 2 of 10, about 8 s left",
+        "preparing data: picture 2 of 10, about 8 s left",
+    ]
+
+
 def test_a_short_job_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     now_s = 0.0
     lines = ProgressLines("preparing data", "picture", lambda: now_s)

@@ -20,6 +20,7 @@ from flocc_agent.core.correction_evidence import CorrectionEvidence
 from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, PersistCorrection, PersistTerm, Report
 from flocc_agent.core.election import LeaderElection
+from flocc_agent.core.foretelling import Foretelling
 from flocc_agent.core.gossip import Gossip
 from flocc_agent.core.known_sets import KeyframeSet
 from flocc_agent.core.latents import Latents, Reach, ToldNowAndThen
@@ -334,6 +335,10 @@ def _has_enough_with_two(original: Callable[..., Any]) -> Callable[..., Any]:
     return lambda self, held, _: original(self, held, 2)
 
 
+def _joins_far_places(original: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda self, pair, low, high, reach: original(self, pair, low, high, 20 * reach)
+
+
 def _lets_nothing_go(_: Callable[..., Any]) -> Callable[..., Any]:
     return lambda self, owner, number: self._warm.append((owner, number))
 
@@ -415,6 +420,7 @@ MUTANTS = (
     # spared pairs
     Mutant("all pairs tell nothing new", Spared, "is_told", always(True)),
     Mutant("two closures are enough", Spared, "__init__", _has_enough_with_two),
+    Mutant("a third log tells what it saw at two places", Foretelling, "_by_third", _joins_far_places),
     # keyframes taken back
     Mutant("nothing is taken back", OwnLog, "_withdraw", always([])),
     Mutant("what was taken back counts", Withdrawals, "counts", always(True)),

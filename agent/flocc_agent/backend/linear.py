@@ -76,7 +76,7 @@ class LinearSolver:
         Raises:
             SingularSystem: Something is not determined.
         """
-        if self._is_iterated(edges, len(state.q)):
+        if self.is_iterated(edges, len(state.q)):
             found = self._iterated(edges, state, at, weights, damping)
             if found is not None:
                 return found
@@ -88,7 +88,8 @@ class LinearSolver:
         """Whether the last step was eliminated, so that covariances cost little more."""
         return self._tree is not None
 
-    def _is_iterated(self, edges: Edges, poses: int) -> bool:
+    def is_iterated(self, edges: Edges, poses: int) -> bool:
+        """Whether conjugate gradients are tried first."""
         many = len(edges) - poses >= self.iterative_loops_min or poses >= self.iterative_poses_min
         return many and not self._gave_up
 
@@ -151,7 +152,7 @@ class LinearSolver:
         """
         moving = [pose for pose in poses if pose != self.fixed]
         try:
-            if len(state.q) > MARGINALS_ELIMINATED_POSES_MAX and self._is_iterated(edges, len(state.q)):
+            if len(state.q) > MARGINALS_ELIMINATED_POSES_MAX and self.is_iterated(edges, len(state.q)):
                 found = self._marginals_iterated(edges, state, at, weights, moving)
             else:
                 tree = self._factorised(edges, state, at, weights)

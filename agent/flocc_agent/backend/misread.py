@@ -57,7 +57,7 @@ def misread(results: Sequence[FactorResult], components: Sequence[Component]) ->
 
 def _in_common(refused: Sequence[FactorResult], component_of: Mapping[LogId, Component], field: str) -> str:
     """What is right about measurements that are refused, and what that hints at."""
-    written = f"is {field} written x y z, then the quaternion w x y z, and not inverted?"
+    written = f"{field} is to be written x y z, then the quaternion w x y z, and not inverted"
     pairs = [(r.factor.T_query_match, T) for r in refused if (T := _solved(r, component_of)) is not None]
     if len(pairs) < MISREAD_MIN:
         return f": {written}"
@@ -68,12 +68,12 @@ def _in_common(refused: Sequence[FactorResult], component_of: Mapping[LogId, Com
     cosine = 0.5 * (np.einsum("kij,kij->k", said[:, :3, :3], solved[:, :3, :3]) - 1.0)
     turned_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
     if _mostly(np.linalg.norm(t_said - t_solved, axis=1) <= may_m) and float(np.median(turned_rad)) > TURNED_RAD:
-        return f", though positions are right: in {field} the quaternion's order is w x y z; are these its axes?"
+        return f", though positions are right: look at the order of {field}'s quaternion (w x y z), and at its axes"
     if _mostly(np.abs(far_m - solved_m) <= may_m):
-        return f", though distances are right: is {field} inverted, or told in the camera's axes, not the body's?"
+        return f", though distances are right: {field} may be inverted, or in the camera's axes instead of the body's"
     ratio = float(np.median(far_m / np.maximum(solved_m, NEAR_M)))
     if _mostly(np.linalg.norm(t_said - ratio * t_solved, axis=1) <= ratio * may_m):
-        return f", and all have them {ratio:.2f} times as far: is a size or a unit wrong?"
+        return f", and all have them {ratio:.2f} times as far: a size or a unit may be wrong"
     return f": {written}"
 
 

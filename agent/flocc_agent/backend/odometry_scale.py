@@ -19,7 +19,7 @@ from flocc_agent.backend.edges import State, residuals
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.mapped import SavedLog
 from flocc_agent.backend.posing import Posed
-from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, continued, explains, solve, solve_once
+from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, continued, explains, searching, solve, solve_once
 from flocc_agent.config import Formulation, Solver
 from flocc_agent.core.pose_graph import Component, GraphSolution, OdometryScale, is_landmark
 from flocc_protocol.ids import LogId
@@ -269,8 +269,16 @@ def estimated(posed: Posed, solved: Solved) -> Estimates:
 
 
 def takes_in(before: SolvedWithScales, applied: SolvedWithScales) -> bool:
-    """Whether with scales at least as many closures are used as without: those that explain nothing turn some away."""
-    return bool(np.count_nonzero(applied.used) >= np.count_nonzero(before.used))
+    """Whether with scales at least as many closures are used as without: those that explain nothing turn some away.
+
+    Where each that is turned away is paid for twice, by what all cost less, the scales do explain: wrong ones that bent
+    odometry of a wrong length fall away, too.
+    """
+    lost = np.count_nonzero(before.used) - np.count_nonzero(applied.used)
+    if lost <= 0:
+        return True
+    price = 0.5 * float(np.max(searching(before.posed.objective).bounds()))
+    return bool(applied.penalised_cost() + lost * price < before.penalised_cost())
 
 
 def relative_to_mean(scale: Float, covariance: Float) -> tuple[Float, Float]:

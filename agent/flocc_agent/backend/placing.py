@@ -27,6 +27,7 @@ from flocc_protocol.ids import LogId
 
 Bool = NDArray[np.bool_]
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 AGREEING_MIN = 2
 HYPOTHESES_MAX = 200
@@ -51,12 +52,22 @@ class Placement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """Proposes placements for one component."""
+    """Proposes placements for one component.
+
+    Attributes:
+        problem: Poses, scales and edges as arrays.
+        trajectories: Of its logs.
+        closures: By their numbers.
+        votes: (L,) of each closure.
+        groups: (L,) number of its group, which shares votes.
+        steepness: Of Eq. (2).
+    """
 
     problem: Problem
     trajectories: Mapping[LogId, Trajectory]
     closures: Mapping[int, LoopClosure]
     votes: Float
+    groups: Int
     steepness: float
 
     def proposals(self, state: State, chosen: Bool) -> Iterator[Placement]:

@@ -14,7 +14,7 @@ from flocc_agent.backend.linear import LinearSolver
 from flocc_agent.backend.placing import Places
 from flocc_agent.backend.problem import Problem, build
 from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN
-from flocc_agent.backend.votes import votes
+from flocc_agent.backend.votes import grouped, votes_of
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import GraphSolution, LoopClosure, Trajectory
 from flocc_protocol.ids import LogId
@@ -80,7 +80,7 @@ def posed(
     problem = build(trajectories, closures, config, recorded).with_lengths(aligned.lengths_m)
     in_order = [(recorded or closures)[k] for k in problem.closure_ids]
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
-    says = votes(trajectories, closures, recorded or closures, config)
+    groups = grouped(trajectories, closures, recorded or closures, config)
     is_held = np.array([k in held for k in problem.closure_ids], dtype=bool)
     aligned_state = state_of(np.concatenate([aligned.T_map_keyframe[log] for log in problem.logs]), problem.clusters)
     return Posed(
@@ -88,7 +88,7 @@ def posed(
         Objective(problem.edges, problem.closure_rows, linear, config, is_held),
         off_half_turns(problem.edges, aligned_state),
         trusted_closures(in_order, is_held, initial) if aligned.is_warm and initial is not None else None,
-        Places(problem, trajectories, closures, says, config.steepness),
+        Places(problem, trajectories, closures, votes_of(groups), groups, config.steepness),
     )
 
 

@@ -6,6 +6,7 @@ at its bound (`edges.GAMMA_MIN`) and the rest moves to the constrained optimum.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from flocc_agent.backend.averaging import averaged
 from flocc_agent.backend.descent import Objective, Solved, descend, voted_cost
 from flocc_agent.backend.edges import State, directions, residuals
 from flocc_agent.backend.graduated import graduated
+from flocc_agent.backend.passages import passages
 from flocc_agent.backend.placing import NEARLY_RATIO, Places
 from flocc_agent.config import Solver
 
@@ -175,7 +177,7 @@ def different(objective: Objective, found: Sequence[Solved]) -> list[Solved]:
 
 
 def replaced(objective: Objective, solved: Solved, places: Places) -> Solved:
-    """Try other places for robots as long as one lowers the truncated cost, and enough closures stay that agree.
+    """Try other places for robots, and passages, as long as one lowers the truncated cost and enough closures stay.
 
     Votes make it cheap to let go of closures that stand close together: where odometry is stated too exact, a place
     that leaves hardly any may cost less than all that bend it (drawn seeds 2088, 2593).
@@ -184,8 +186,10 @@ def replaced(objective: Objective, solved: Solved, places: Places) -> Solved:
     for _ in range(PLACEMENTS_MAX):
         chosen, better = accepted(objective, solved), None
         votes_min = NEARLY_RATIO * places.votes[chosen].sum()
-        for placement in places.proposals(solved.state, chosen):
-            moved = descend(objective, placement.state, objective.weights(placement.chosen.astype(float)), 5)
+        taken_in = passages(objective, solved.state, chosen, places.votes, places.groups)
+        others = ((placement.state, placement.chosen) for placement in places.proposals(solved.state, chosen))
+        for start, begun in chain(others, ((solved.state, chosen | members) for members in taken_in)):
+            moved = descend(objective, start, objective.weights(begun.astype(float)), 5)
             there = selected(objective, moved.state, moved.iterations)
             if places.votes[accepted(objective, there)].sum() < votes_min:
                 continue

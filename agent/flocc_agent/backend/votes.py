@@ -27,13 +27,18 @@ PARTNERS_MAX = 16
 """How many others, the nearest ones, each closure is compared with; groups are transitive."""
 
 
-def votes(
+def votes_of(groups: Int) -> Float:
+    """Votes (L,) of closures whose groups (L,) are given: n of a group count as the cube root of n."""
+    return np.asarray(np.bincount(groups)[groups] ** (VOTES_POWER - 1.0)) if len(groups) else np.zeros(0)
+
+
+def grouped(
     trajectories: Mapping[LogId, Trajectory],
     closures: Mapping[int, LoopClosure],
     recorded: Mapping[int, LoopClosure],
     config: BackendConfig,
-) -> Float:
-    """Votes (L,) of closures in the order of their numbers: n of a group count as the cube root of n.
+) -> Int:
+    """The number of its group (L,) of each closure, in the order of their own numbers.
 
     A group is closures of two robots that are fewer than `cluster_keyframes_max` keyframes apart on both sides and
     agree with each other, within what uncertainties that are understated as far as alarms believe allow.
@@ -46,7 +51,7 @@ def votes(
     """
     place = {k: n for n, k in enumerate(sorted(closures))}
     if not place:
-        return np.zeros(0)
+        return np.zeros(0, dtype=np.int64)
     ways = {log: Way.of(trajectory, config) for log, trajectory in trajectories.items()}
     joined = [np.zeros((0, 2), dtype=np.int64)]
     for (a, b), ids in by_logs(closures).items():
@@ -59,8 +64,7 @@ def votes(
             joined.append(np.array([place[k] for k in ids])[near[agree]])
     i, j = np.concatenate(joined).T
     graph = coo_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(len(place), len(place)))
-    labels = connected_components(graph, directed=False)[1]
-    return np.asarray(np.bincount(labels)[labels] ** (VOTES_POWER - 1.0))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def _near(ids: list[int], recorded: Mapping[int, LoopClosure], keyframes_max: int) -> Int:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.closure_rows import ClosureTable, Tie
 from flocc_agent.core.cold_storage import ColdPieces, RowPieces
+from flocc_agent.core.foretelling import Foretelling
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords, is_unmeasured
 from flocc_agent.core.parameters import KEYFRAMES_HELD
@@ -23,10 +24,9 @@ from flocc_agent.core.pose_graph import LoopClosure, MeasuredFactor, PoseGraph, 
 from flocc_agent.core.pulls import remember
 from flocc_agent.core.registration import ODOMETRY_CORRESPONDENCES_MIN
 from flocc_agent.core.saved_map import SavedMap
-from flocc_agent.core.spared import AGREE_LENGTHS, AGREE_RATIO, AGREE_STEPS, Foretold
 from flocc_agent.core.tentative_joins import TentativeJoins
 from flocc_agent.core.withdrawals import Withdrawals
-from flocc_agent.geometry import between, inverse, pose7, pose_from_tq, poses_from_tq
+from flocc_agent.geometry import between, pose7, pose_from_tq, poses_from_tq
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
@@ -88,25 +88,19 @@ class _Odometry:
 
     def poses(self, indices: Sequence[int]) -> Float:
         """`T_odom_keyframe` (K, 4, 4) of some keyframes."""
-        return poses_from_tq(self._rows(indices))
+        return poses_from_tq(self.tq(indices))
 
     def positions_m(self, indices: Sequence[int]) -> Float:
         """Where they were (K, 3)."""
-        return self._rows(indices)[:, :3]
+        return self.tq(indices)[:, :3]
 
-    def _rows(self, indices: Sequence[int]) -> Float:
+    def tq(self, indices: Sequence[int]) -> Float:
+        """The same as rows (K, 7): translation x y z, quaternion w x y z."""
         return np.frombuffer(b"".join(self._poses.row(index) for index in indices)).reshape(-1, 7)
 
     def pose(self, index: int) -> Float:
         """`T_odom_keyframe` (4, 4)."""
         return pose_from_tq(np.frombuffer(self._poses.row(index)))
-
-    def seen_from(self, index: int, others: Sequence[int]) -> Float:
-        """Poses (1 + K, 4, 4) in the frame of one keyframe, of the one before it or after it, and of K others."""
-        before = index - 1 if index else min(1, len(self) - 1)
-        rows = b"".join(self._poses.row(each) for each in (index, before, *others))
-        T = poses_from_tq(np.frombuffer(rows).reshape(-1, 7))
-        return between(T[:1], T[1:])
 
     def stamp_s(self, index: int) -> float:
         """When a keyframe was taken."""
@@ -141,6 +135,7 @@ class GraphAssembly:
     Attributes:
         keyframes: Number of keyframes of all logs but those of an opened map, which are solved already.
         withdrawals: Which keyframes were taken back; closures of them do not count.
+        foretelling: What closures say of pairs around them.
     """
 
     def __init__(
@@ -167,6 +162,7 @@ class GraphAssembly:
         self.withdrawals = Withdrawals()
         self._closures = ClosureTable(cold_closures, closures_built_max, self.withdrawals.rank)
         self._tentative = TentativeJoins(self._closures, self._odometry.get)
+        self.foretelling = Foretelling(self._closures, self._odometry.get, self._known)
         self._reads_all = True
         self._early: dict[KeyframeId, int] = {}
         self._measured = MeasuredRecords()
@@ -265,30 +261,6 @@ class GraphAssembly:
             self.keyframes -= len(odometry)
             self._revision += 1
         self._forget_pairs(log)
-
-    def beside(self, pair: CandidatePair, reach: int) -> list[CandidatePair]:
-        """Closures with a length between the same stretches as a pair, as far as all keyframes are known."""
-        if not self._known(pair.low) or not self._known(pair.high):
-            return []
-        found = self._closures.beside(pair, reach)
-        return [closure for closure in found if self._known(closure.low) and self._known(closure.high)]
-
-    def density(self, keyframe: KeyframeId, reach: int) -> float:
-        """Closures for each keyframe of a stretch, with whatever other keyframes."""
-        if not self._known(keyframe):
-            return 0.0
-        first, end = max(keyframe.index - reach, 0), min(keyframe.index + reach + 1, len(self._odometry[keyframe.log]))
-        return self._closures.ends(keyframe.log, first, end) / (end - first)
-
-    def foretold(self, pair: CandidatePair, closures: list[CandidatePair]) -> Foretold:
-        """What closures beside a pair say of it, by odometry from their keyframes to the pair's."""
-        T = self._closures.poses(closures)
-        low = self._odometry[pair.low.log].seen_from(pair.low.index, [closure.low.index for closure in closures])
-        high = self._odometry[pair.high.log].seen_from(pair.high.index, [closure.high.index for closure in closures])
-        lengths_m, low_m, high_m = (np.linalg.norm(each[:, :3, 3], axis=1) for each in (T, low[1:], high[1:]))
-        steps_m = (float(np.linalg.norm(low[0, :3, 3])) + float(np.linalg.norm(high[0, :3, 3]))) / 2
-        may_m = AGREE_LENGTHS * lengths_m + AGREE_RATIO * (low_m + high_m) + AGREE_STEPS * steps_m
-        return Foretold(low[1:] @ T @ inverse(high[1:]), may_m)
 
     def measured(self, log: LogId) -> Sequence[MeasuredFactor]:
         """What else was measured at a log's keyframes, or of them."""

@@ -1,13 +1,13 @@
 """All closures that a robot knows: one of each pair, those of a log, and the graph's.
 
 Every robot takes in every closure, and it is looked at now and then: what a closure says is a row of bytes, of which
-old ones leave memory; 12 bytes of its pair and 4 for each of its logs remain. Who leads looks at all of them in each
+old ones leave memory; 12 bytes of its pair and 12 for each of its ends remain. Who leads looks at all of them in each
 round, and keeps as many as it built.
 """
 
 import math
 from array import array
-from bisect import bisect_left
+from bisect import bisect_left, insort
 from collections.abc import Callable, Iterable, Sequence, Set
 from struct import Struct
 from typing import NamedTuple
@@ -53,7 +53,8 @@ PACKED = Struct("<8I7ddd")
 WHERE = Struct("<8I3d")
 """Of a row: what comes before the rotation."""
 SCALE_AT = ROW.fields["scale"][1] if ROW.fields is not None else 0
-COUNT_MAX = 2**16 - 1
+ROWS_MAX = 2**32
+"""More than there can be: rows are numbered with four bytes."""
 LENGTH_MIN = 1e-9
 Rank = Callable[[LogId, int, CandidatePair], int]
 Counts = Callable[[LogId, int, CandidatePair], bool]
@@ -67,6 +68,14 @@ class Tie(NamedTuple):
     near: int
     far: KeyframeId
     length_m: float
+
+
+class End(NamedTuple):
+    """One end of a closure that has a length: its keyframe in a stretch, the other end, and its row in the table."""
+
+    near: int
+    far: KeyframeId
+    row: int
 
 
 def length_m(closure: ClosureRecord) -> float:
@@ -105,7 +114,7 @@ class ClosureTable:
         self._of_log: dict[LogId, array[int]] = {}
         """Rows of a log, in the order in which they became known."""
         self._ends: dict[LogId, array[int]] = {}
-        """How many closures each keyframe of a log has."""
+        """Closures at the keyframes of a log: keyframe and row as one number, in their order."""
         self._count = 0
 
     def __len__(self) -> int:
@@ -136,14 +145,14 @@ class ClosureTable:
                 return False
             for each in logs:
                 self._of_log[each].remove(held)
+            self._take_ends(pair, held)
             self._built.pop(held, None)
             rows[at] = row
         else:
             numbers.insert(at, packed)
             rows.insert(at, row)
             self._count += 1
-            self._count_end(pair.low)
-            self._count_end(pair.high)
+        self._put_ends(pair, row)
         for each in logs:
             of_log = self._of_log.get(each)
             if of_log is None:
@@ -179,8 +188,7 @@ class ClosureTable:
             self._of_log[each].remove(row)
         self._built.pop(row, None)
         self._count -= 1
-        for keyframe in (pair.low, pair.high):
-            self._ends[keyframe.log][keyframe.index] -= 1
+        self._take_ends(pair, row)
 
     def _order(self, log: LogId, number: int, pair: CandidatePair) -> tuple[int, LogId, int]:
         return -self._rank(log, number, pair), log, number
@@ -190,39 +198,46 @@ class ClosureTable:
         rows = self._of_log.get(log)
         return [] if rows is None else [self._tie(log, row) for row in rows[-ties_max:][::-1]]
 
-    def beside(self, pair: CandidatePair, reach: int) -> list[CandidatePair]:
-        """Closures with a length whose keyframes are at most so many from a pair's, at both ends."""
-        of_pair = self._of_pair.get((pair.low.log, pair.high.log))
-        if of_pair is None:
-            return []
-        numbers, rows = of_pair
-        found: list[CandidatePair] = []
-        for k in range(bisect_left(numbers, max(pair.low.index - reach, 0) * (INDEX_MAX + 1)), len(numbers)):
-            other = pair_of((pair.low.log, pair.high.log), numbers[k])
-            if other.low.index > pair.low.index + reach:
-                break
-            if abs(other.high.index - pair.high.index) <= reach and self._tie(pair.low.log, rows[k]).length_m > 0.0:
-                found.append(other)
-        return found
-
     def ends(self, log: LogId, first: int, end: int) -> int:
         """Closures at keyframes of a log, from one to before another, whatever log is at their other end."""
-        counts = self._ends.get(log)
-        return 0 if counts is None else sum(counts[first:end])
+        of_log = self._ends.get(log)
+        return 0 if of_log is None else bisect_left(of_log, end * ROWS_MAX) - bisect_left(of_log, first * ROWS_MAX)
 
-    def poses(self, closures: Sequence[CandidatePair]) -> Float:
-        """What closures say, T_low_high (K, 4, 4) in metres by their first scale; without one no translation."""
-        T, has_length = self.said(closures)
-        T[~has_length, :3, 3] = 0.0
+    def mark(self, log: LogId, first: int, end: int) -> int:
+        """A number of the same closures that is another one when one comes, leaves or is registered anew."""
+        of_log = self._ends.get(log)
+        if of_log is None:
+            return 0
+        return sum(of_log[bisect_left(of_log, first * ROWS_MAX) : bisect_left(of_log, end * ROWS_MAX)])
+
+    def near(self, log: LogId, first: int, end: int) -> list[End]:
+        """Those of them that have a length."""
+        of_log = self._ends.get(log)
+        if of_log is None:
+            return []
+        number, found = self._numbers[log], list[End]()
+        for each in of_log[bisect_left(of_log, first * ROWS_MAX) : bisect_left(of_log, end * ROWS_MAX)]:
+            near, row = divmod(each, ROWS_MAX)
+            query_log, query, match_log, match, _, _, has_scale, _, *t = WHERE.unpack_from(self._rows.row(row))
+            if has_scale and any(t):
+                is_query = query_log == number and query == near
+                far = KeyframeId(self._logs[match_log], match) if is_query else KeyframeId(self._logs[query_log], query)
+                found.append(End(near, far, row))
+        return found
+
+    def seen(self, log: LogId, ends: Sequence[End]) -> Float:
+        """What closures say of their other ends, T_near_far (K, 4, 4) metric."""
+        rows = self._rows_of(end.row for end in ends)
+        T, _ = _metric(rows)
+        queries = zip(rows["query_log"].tolist(), rows["query"].tolist(), ends, strict=True)
+        back = [(query_log, query) != (self._numbers[log], end.near) for query_log, query, end in queries]
+        T[back] = inverse(T[back])
         return T
 
     def said(self, closures: Sequence[CandidatePair]) -> tuple[Float, NDArray[np.bool_]]:
         """What closures say, T_low_high (K, 4, 4), and whether in metres; else the translation is 1 long."""
-        rows = np.frombuffer(b"".join(self._rows.row(self._row(closure)) for closure in closures), dtype=ROW)
-        T = poses_from_tq(rows["T"])
-        lengths = np.linalg.norm(T[:, :3, 3], axis=1)
-        has_length = (rows["has_scale"] > 0) & (rows["scale"] * lengths > 0.0)
-        T[:, :3, 3] *= np.where(has_length, rows["scale"], 1.0 / np.maximum(lengths, LENGTH_MIN))[:, None]
+        rows = self._rows_of(self._row(closure) for closure in closures)
+        T, has_length = _metric(rows)
         queries = [KeyframeId(self._logs[row["query_log"]], int(row["query"])) for row in rows]
         back = [query != closure.low for query, closure in zip(queries, closures, strict=True)]
         T[back] = inverse(T[back])
@@ -237,19 +252,28 @@ class ClosureTable:
         numbers, rows = self._of_pair[pair.low.log, pair.high.log]
         return rows[place_of(numbers, pair_number(pair))[0]]
 
-    def _count_end(self, keyframe: KeyframeId) -> None:
-        counts = self._ends.get(keyframe.log)
-        if counts is None:
-            counts = self._ends[keyframe.log] = array("H")
-        index = keyframe.index
-        if index >= len(counts):
-            counts.extend([0] * (index + 1 - len(counts)))
-        if counts[index] < COUNT_MAX:
-            counts[index] += 1
+    def _rows_of(self, numbers: Iterable[int]) -> Rows:
+        return np.frombuffer(b"".join(self._rows.row(number) for number in numbers), dtype=ROW)
+
+    def _put_ends(self, pair: CandidatePair, row: int) -> None:
+        for keyframe in (pair.low, pair.high):
+            of_log = self._ends.get(keyframe.log)
+            if of_log is None:
+                of_log = self._ends[keyframe.log] = array("Q")
+            insort(of_log, keyframe.index * ROWS_MAX + row)
+
+    def _take_ends(self, pair: CandidatePair, row: int) -> None:
+        for keyframe in (pair.low, pair.high):
+            of_log = self._ends[keyframe.log]
+            del of_log[bisect_left(of_log, keyframe.index * ROWS_MAX + row)]
 
     def links(self) -> list[tuple[LogId, LogId]]:
         """Pairs of logs with closures between them, or within one."""
         return sorted(self._of_pair)
+
+    def logs_count(self) -> int:
+        """How many logs there are that closures were ever of, or stood in."""
+        return len(self._logs)
 
     def logs(self) -> set[LogId]:
         """Logs that closures are of, or stand in."""
@@ -353,3 +377,12 @@ def _float32(values: Array) -> bytes:
     if values.dtype == "f4":
         return values.data
     return np.clip(values.numpy(), -FLOAT32_MAX, FLOAT32_MAX).astype("<f4").tobytes()
+
+
+def _metric(rows: Rows) -> tuple[Float, NDArray[np.bool_]]:
+    """What closures say, T_query_match (K, 4, 4), and whether in metres; else the translation is 1 long."""
+    T = poses_from_tq(rows["T"])
+    lengths = np.linalg.norm(T[:, :3, 3], axis=1)
+    has_length = (rows["has_scale"] > 0) & (rows["scale"] * lengths > 0.0)
+    T[:, :3, 3] *= np.where(has_length, rows["scale"], 1.0 / np.maximum(lengths, LENGTH_MIN))[:, None]
+    return T, has_length

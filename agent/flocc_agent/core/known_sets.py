@@ -1,12 +1,13 @@
 """Sets that grow with the mission, in few bytes: of keyframes, and of pairs of them.
 
 A set is whole numbers in their order, an array for each log or pair of logs: 4 bytes a keyframe and 8 a pair, where
-objects take some 200 and 300. A table of pairs is bounded, and finds those of the same stretches of two ways.
+objects take some 200 and 300. A table of pairs is bounded, and finds those with a keyframe of the same stretch.
 """
 
 from array import array
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from itertools import product
 from typing import Generic, TypeVar
 
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId
@@ -89,6 +90,8 @@ class KeyframeSet:
 
 
 Value = TypeVar("Value")
+BLOCK = 16
+"""Keyframes of a log that are looked for together."""
 
 
 class PairTable(Generic[Value]):
@@ -98,7 +101,7 @@ class PairTable(Generic[Value]):
         """Start without any, for at most so many."""
         self._pairs_max = pairs_max
         self._values: dict[CandidatePair, Value] = {}
-        self._of_logs: dict[tuple[LogId, LogId], dict[CandidatePair, None]] = {}
+        self._of_block: dict[tuple[LogId, int], dict[CandidatePair, None]] = {}
 
     def __contains__(self, pair: CandidatePair) -> bool:
         return pair in self._values
@@ -113,7 +116,8 @@ class PairTable(Generic[Value]):
     def put(self, pair: CandidatePair, value: Value) -> None:
         """Take a pair in; one that is there keeps its place."""
         self._values[pair] = value
-        self._of_logs.setdefault((pair.low.log, pair.high.log), {})[pair] = None
+        for block in _blocks_of(pair):
+            self._of_block.setdefault(block, {})[pair] = None
         if len(self._values) > self._pairs_max:
             self.pop(next(iter(self._values)))
 
@@ -121,22 +125,43 @@ class PairTable(Generic[Value]):
         """Leave a pair out; its value, None where it was not there."""
         value = self._values.pop(pair, None)
         if value is not None:
-            logs = pair.low.log, pair.high.log
-            del self._of_logs[logs][pair]
-            if not self._of_logs[logs]:
-                del self._of_logs[logs]
+            for block in _blocks_of(pair):
+                del self._of_block[block][pair]
+                if not self._of_block[block]:
+                    del self._of_block[block]
         return value
 
-    def beside(self, pair: CandidatePair, reach: int) -> Iterator[CandidatePair]:
-        """Pairs of the same logs whose keyframes are at most so many from a pair's, at both ends."""
-        of_logs = self._of_logs.get((pair.low.log, pair.high.log), ())
-        return (other for other in of_logs if is_beside(pair, other, reach))
+    def beside(self, pair: CandidatePair, reach: int) -> list[CandidatePair]:
+        """Pairs of the same logs whose keyframes are at most so many from a pair's, at both ends; in their order."""
+        found = self._around(pair.low, reach)
+        logs = pair.low.log, pair.high.log
+        return sorted(p for p in found if (p.low.log, p.high.log) == logs and is_beside(pair, p, reach))
+
+    def near(self, pair: CandidatePair, reach: int) -> list[CandidatePair]:
+        """Pairs with a keyframe that is at most so many from one of a pair's, in their order."""
+        found = self._around(pair.low, reach) | self._around(pair.high, reach)
+        return sorted(other for other in found if is_near(pair, other, reach))
+
+    def _around(self, keyframe: KeyframeId, reach: int) -> set[CandidatePair]:
+        log, index = keyframe
+        blocks = range((index - reach) // BLOCK, (index + reach) // BLOCK + 1)
+        return {pair for block in blocks for pair in self._of_block.get((log, block), ())}
+
+
+def is_near(pair: CandidatePair, other: CandidatePair, reach: int) -> bool:
+    """Whether a keyframe of one pair is in a stretch of the other."""
+    ends = product((pair.low, pair.high), (other.low, other.high))
+    return any(one.log == end.log and abs(one.index - end.index) <= reach for one, end in ends)
 
 
 def is_beside(pair: CandidatePair, other: CandidatePair, reach: int) -> bool:
     """Whether two pairs of the same two logs are of the same stretches."""
     low, high = abs(pair.low.index - other.low.index), abs(pair.high.index - other.high.index)
     return low <= reach and high <= reach
+
+
+def _blocks_of(pair: CandidatePair) -> dict[tuple[LogId, int], None]:
+    return dict.fromkeys((log, index // BLOCK) for log, index in (pair.low, pair.high))
 
 
 def _is_of_stretch(pair: CandidatePair, log: LogId, first: int, end: int) -> bool:

@@ -28,7 +28,7 @@ from flocc_agent.core.prospects import UNLIKELY, Agreement, Prospect, Prospects
 from flocc_agent.core.pulls import remember
 from flocc_agent.core.reports import CandidateFound
 from flocc_agent.core.spared import HeldClosures, NoClosures, Spared
-from flocc_agent.core.work import OdometryPairOf, WorkTable
+from flocc_agent.core.work import OdometryPairOf, Order, WorkTable
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidateOffer, CandidatePair
 
@@ -89,7 +89,7 @@ class LoopClosing:
         self._front_ends = FrontEnds()
         self._prospects = Prospects(agreement)
         self._unlikely: list[CandidatePair] = []
-        self._spared = Spared(held or NoClosures(), parameters.closures_enough)
+        self._spared = Spared(held or NoClosures(), parameters.closures_enough, parameters.sparing_logs_min)
         self._told: list[CandidatePair] = []
         self._chosen: list[CandidatePair] | None = None
         self._resolved = PairSet()
@@ -145,7 +145,8 @@ class LoopClosing:
         """Pairs that would tell whether two ways are joined rightly: a few come before all others, each once."""
         effects: list[Effect] = []
         candidates = list(candidates)
-        waiting = sum(self._prospects.was_asked(c.pair) and c.pair not in self._resolved for c in candidates)
+        asked = [candidate.pair for candidate in candidates if self._prospects.was_asked(candidate.pair)]
+        waiting = sum(pair not in self._resolved and pair not in self._spared for pair in asked)
         for candidate in candidates:
             if waiting >= ASKED_AT_ONCE:
                 break
@@ -154,11 +155,13 @@ class LoopClosing:
                 continue
             if self._prospects.was_refused_unseen(pair):
                 self._reopen(pair)
+            if self._is_due_anyway(pair):
+                self._spared.remove(pair)
             if not self._knows(pair):
                 fact = CandidateFound(query=pair.low, match=pair.high, similarity=round(similarity, 4))
                 effects.append(Report(fact))
                 self._assign(Candidate(pair, ASKED_ORDER), now)
-            waiting += pair not in self._resolved
+            waiting += pair not in self._resolved and pair not in self._spared
         return effects
 
     def on_offer(self, offer: CandidateOffer, now: float) -> None:
@@ -184,6 +187,7 @@ class LoopClosing:
         A stronger robot may hold the same record, and would not begin.
         """
         self._reopen(pair)
+        self._spared.need(pair)
         self._add(Candidate(pair, 0.0))
 
     def _reopen(self, pair: CandidatePair) -> None:
@@ -219,6 +223,8 @@ class LoopClosing:
         self._resolved.discard(pair)
         if not self._knows(pair) and self._concerns(pair):
             self._assign(Candidate(pair, 0.0), now)
+        for other, similarity in self._spared.on_gone(pair):
+            self._assign(Candidate(other, similarity), now)
 
     def on_resolved(self, pair: CandidatePair) -> None:
         """A record of this pair is in a log: nobody needs to register it."""
@@ -257,7 +263,7 @@ class LoopClosing:
             if self._owner(other) == self._own:
                 self._assign(Candidate(other, 0.0), now)
         self._spare_beside(pair)
-        for other, similarity in self._spared.on_closure(pair):
+        for other, similarity in self._spared.on_closure(pair, is_own):
             self._assign(Candidate(other, similarity), now)
 
     def on_rejection(self, pair: CandidatePair, reason: str, was_seen: bool = True) -> bool:
@@ -444,17 +450,25 @@ class LoopClosing:
 
     def _spares(self, candidate: Candidate) -> bool:
         """Whether a pair tells nothing new; then nobody waits for it."""
-        if not self._spared.is_told(candidate.pair):
+        if self._is_due_anyway(candidate.pair) or not self._spared.is_told(candidate.pair):
             return False
         self._spared.add(candidate.pair, candidate.similarity)
         self._told.append(candidate.pair)
         return True
 
+    def _is_due_anyway(self, pair: CandidatePair) -> bool:
+        """Whether a pair is asked for and to be registered here; another robot does not know that it is asked for."""
+        if not self._prospects.was_asked(pair) or self._owner(pair) != self._own:
+            return False
+        return self._reach.stronger(self._compute_class) is None
+
     def _spare_beside(self, closure: CandidatePair) -> None:
         """Spare pairs beside a new closure that nobody began to register here."""
-        if not self._parameters.closures_enough:
-            return
-        for similarity, pair in self._work.beside(closure):
+        if self._spared.is_any():
+            self._spare_told(self._work.beside(closure))
+
+    def _spare_told(self, waiting: Iterable[Order]) -> None:
+        for similarity, pair in waiting:
             if self._spares(Candidate(pair, -similarity)):
                 self._work.remove(pair)
                 self._chosen, self._changed = None, True
@@ -525,6 +539,10 @@ class LoopClosing:
             work = self._work.start_next(now + REGISTRATION_TIMEOUT_S, self._choice())
             if work is None:
                 break
+            if self._spares(Candidate(work.pair, -work.order[0])):
+                self._work.remove(work.pair)
+                self._chosen = None
+                continue
             assert work.odometry is not None
             effects.append(Register(work.pair, work.query, work.match, *work.odometry))
         return effects
@@ -564,6 +582,8 @@ class LoopClosing:
     def _worth_fetching(self, now: float) -> Iterator[KeyframeId]:
         """The same without those of which no pair is likely; pairs that stay so are to be refused, a few at a time."""
         for keyframe in self._fetchable():
+            if self._spared.is_any():
+                self._spare_told(self._work.waiting(keyframe))
             prospects = {pair: self._prospects.of(pair, now) for pair in self._work.using(keyframe)}
             if keyframe.log == self._own or Prospect.LIKELY in prospects.values():
                 yield keyframe

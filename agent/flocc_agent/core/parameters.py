@@ -128,9 +128,10 @@ class LoopClosingParameters:
     """Pairs registered at one time; more than workers only fills their queue."""
     candidates_max: int = _inner(4000)
     """Open candidates; the least similar ones are dropped beyond this."""
-    closures_enough: int = _inner(0)
-    """Of the same stretches of two ways no more pairs are registered once so many closures agree; 0: all are. Off: it
-    saves few bytes and no time, and costs accuracy where it saves most (docs/scaling.md)."""
+    closures_enough: int = _inner(3)
+    """Of the same stretches of two ways no more pairs are registered once so many ways agree; 0: all are."""
+    sparing_logs_min: int = _inner(32)
+    """Of so many logs that closures join: every robot learns every closure, and in a smaller team they cost little."""
 
     def __post_init__(self) -> None:
         _require(self.match_ratio_threshold >= 0, "match_ratio_threshold must not be negative")
@@ -140,6 +141,7 @@ class LoopClosingParameters:
         _require(self.registrations_max >= 1, "registrations_max must be at least 1")
         _require(self.candidates_max >= 1, "candidates_max must be at least 1")
         _require(self.closures_enough >= 0, "closures_enough must not be negative")
+        _require(self.sparing_logs_min >= 0, "sparing_logs_min must not be negative")
 
 
 @dataclass(frozen=True, slots=True)

@@ -147,7 +147,7 @@ class Robot:
             closed,
             listens_until_s,
             self.recognition.agreement,
-            self.assembly,
+            self.assembly.foretelling,
         )
         self.closing.latents.names.record_at = self._record_at
         self._intake = RecordIntake(log, self.gossip, self.assembly, self.recognition, self.closing, restored)
@@ -227,8 +227,10 @@ class Robot:
 
     @property
     def closures_enough(self) -> int:
-        """Agreeing closures of two stretches beside which no more pairs are registered; 0: all are."""
-        return self._parameters.loop_closing.closures_enough
+        """Agreeing ways between two stretches beside which no more pairs are registered; 0: all are."""
+        parameters = self._parameters.loop_closing
+        is_large = self.assembly.foretelling.logs() >= parameters.sparing_logs_min
+        return parameters.closures_enough if is_large else 0
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Every queue, table and cache: how much is in it, and its maximum."""

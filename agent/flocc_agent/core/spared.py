@@ -3,10 +3,13 @@
 Two robots that drive along one road have a candidate at every keyframe, and each closure is learnt by the whole team.
 Where `closures_enough` closures between the same stretches of both ways agree, one more tells nothing new: odometry
 carries what they say to every keyframe of the stretch, with less error than a registration has. So a stretch is
-`STRETCH` keyframes to either side of a pair, at both of its ends, and a later visit is another one.
+`STRETCH` keyframes to either side of a pair, at both of its ends, and a later visit is another one. What two closures
+say by way of a third robot counts like one (`foretelling.py`): in a large team each pair of robots has few closures,
+and many by way of others.
 
 A stretch is weak, and its pairs are registered, where it has few closures in all, where these have no length, where
 odometry is not here or tears them apart, and where some contradict: each of those takes `CONTRADICTED` that agree.
+Each closure costs as much as there are robots that learn it: in a small team all pairs are registered.
 Nothing is written of a spared pair. Whether it is follows from records, so that all robots which hold the same ones
 spare the same; it is taken up again when a later closure contradicts.
 """
@@ -28,9 +31,9 @@ TOLD = "closures beside it tell it already"
 """Why a pair was spared, for people."""
 STRETCH = 5
 """Keyframes to either side of both ends."""
-TIED_MIN = 2.0
-"""Closures for each keyframe of both stretches, with whatever other keyframes. Where a graph is thinner each closure
-makes it better, also where others say nearly the same."""
+TIED_MIN = 1.0
+"""Ends of closures for each keyframe of both stretches, with whatever other keyframes: each closure has two ends. Where
+a graph is thinner each closure makes it better, also where others say nearly the same (docs/scaling.md)."""
 CONTRADICTED = 2
 """Closures that must agree for each one that does not, besides those that are enough."""
 AGREE_RAD = np.deg2rad(10.0)
@@ -51,81 +54,111 @@ class Foretold:
     Attributes:
         T_low_high: (K, 4, 4) pose of the later keyframe in the earlier one, metric.
         may_m: (K,) how far off each may be.
+        is_whole: Whether the keyframes of all closures there were known.
     """
 
     T_low_high: Float
     may_m: Float
+    is_whole: bool = True
+
+    @classmethod
+    def nothing(cls, is_whole: bool = True) -> "Foretold":
+        """No closure says anything."""
+        return cls(np.empty((0, 4, 4)), np.empty(0), is_whole)
 
 
 class HeldClosures(Protocol):
     """Closures that a robot knows."""
 
-    def beside(self, pair: CandidatePair, reach: int) -> list[CandidatePair]:
-        """Those that have a length between two stretches, as far as their keyframes are known."""
+    def logs(self) -> int:
+        """How many logs closures are of."""
+        ...
+
+    def mark(self, keyframe: KeyframeId, reach: int) -> int:
+        """A number of the closures of a stretch that is another one when these change."""
         ...
 
     def density(self, keyframe: KeyframeId, reach: int) -> float:
-        """Closures for each keyframe of a stretch, with whatever other keyframes."""
+        """Ends of closures for each keyframe of a stretch, whatever keyframes are at their other ends."""
         ...
 
-    def foretold(self, pair: CandidatePair, closures: list[CandidatePair]) -> Foretold:
-        """What they say of another pair of these stretches."""
+    def foretold(self, pair: CandidatePair, reach: int, least: int = 1) -> Foretold:
+        """What closures of two stretches say of a pair there; nothing where fewer do than the least that matters."""
         ...
 
 
 class NoClosures:
     """What a robot knows that spares no pair."""
 
-    def beside(self, pair: CandidatePair, reach: int) -> list[CandidatePair]:  # noqa: ARG002
+    def logs(self) -> int:
         """None."""
-        return []
+        return 0
+
+    def mark(self, keyframe: KeyframeId, reach: int) -> int:  # noqa: ARG002
+        """None."""
+        return 0
 
     def density(self, keyframe: KeyframeId, reach: int) -> float:  # noqa: ARG002
         """None."""
         return 0.0
 
-    def foretold(self, pair: CandidatePair, closures: list[CandidatePair]) -> Foretold:  # noqa: ARG002
+    def foretold(self, pair: CandidatePair, reach: int, least: int = 1) -> Foretold:  # noqa: ARG002
         """Nothing."""
-        return Foretold(np.empty((0, 4, 4)), np.empty(0))
+        return Foretold.nothing()
 
 
 class Spared:
     """Pairs that one robot found, or was offered, and that are not to be registered."""
 
-    def __init__(self, held: HeldClosures, enough: int) -> None:
+    def __init__(self, held: HeldClosures, enough: int, logs_min: int = 0) -> None:
         """Start without any.
 
         Args:
             held: Closures.
             enough: So many that agree; 0: no pair is spared.
+            logs_min: With closures of fewer logs no pair is spared either.
         """
         self._held = held
         self._enough = enough
+        self._logs_min = logs_min
         self._similarities: PairTable[float] = PairTable(SPARED_MAX)
-        self._weak: dict[CandidatePair, int] = {}
+        self._weak: dict[CandidatePair, tuple[int, int]] = {}
+        """What was known of pairs that were not told."""
+        self._needed: dict[CandidatePair, None] = {}
 
     def __contains__(self, pair: CandidatePair) -> bool:
         return pair in self._similarities
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
-        return {"spared": self._similarities.size(), "weak": (len(self._weak), LOOKED_MAX)}
+        looked = {"weak": (len(self._weak), LOOKED_MAX), "needed": (len(self._needed), LOOKED_MAX)}
+        return {"spared": self._similarities.size(), **looked}
+
+    def is_any(self) -> bool:
+        """Whether pairs are spared at all, with the closures that are known."""
+        return self._enough > 0 and self._held.logs() >= self._logs_min
 
     def is_told(self, pair: CandidatePair) -> bool:
         """Whether closures beside a pair tell what it would."""
-        if not self._enough:
-            return False
-        beside = self._held.beside(pair, STRETCH)
-        if len(beside) < self._enough or self._weak.get(pair) == len(beside):
+        if not self.is_any() or pair in self._needed:
             return False
         if min(self._held.density(pair.low, STRETCH), self._held.density(pair.high, STRETCH)) < TIED_MIN:
             return False
-        agreeing = agreeing_of(self._held.foretold(pair, beside))
-        if agreeing - CONTRADICTED * (len(beside) - agreeing) >= self._enough:
+        marks = self._held.mark(pair.low, STRETCH), self._held.mark(pair.high, STRETCH)
+        if self._weak.get(pair) == marks:
+            return False
+        foretold = self._held.foretold(pair, STRETCH, self._enough)
+        agreeing = agreeing_of(foretold)
+        if agreeing - CONTRADICTED * (len(foretold.may_m) - agreeing) >= self._enough:
             return True
         self._weak.pop(pair, None)
-        remember(self._weak, pair, len(beside), LOOKED_MAX)
+        if foretold.is_whole:
+            remember(self._weak, pair, marks, LOOKED_MAX)
         return False
+
+    def need(self, pair: CandidatePair) -> None:
+        """Somebody waits for a pair whose records do not reach it: whatever is known here does not tell it."""
+        remember(self._needed, pair, None, LOOKED_MAX)
 
     def add(self, pair: CandidatePair, similarity: float) -> None:
         """A pair is not to be registered for now."""
@@ -137,22 +170,32 @@ class Spared:
         self._weak.pop(pair, None)
         self._similarities.pop(pair)
 
-    def on_closure(self, pair: CandidatePair) -> list[tuple[CandidatePair, float]]:
-        """A closure became known; pairs that it makes weak again, with their similarity. They are spared no more."""
-        if not self._enough:
+    def on_closure(self, pair: CandidatePair, is_own: bool = True) -> list[tuple[CandidatePair, float]]:
+        """A closure became known; pairs that it makes weak again, with their similarity. They are spared no more.
+
+        It is held against what others foretell of it. One of two other robots says something of pairs between the same
+        stretches alone: those two look at what else it contradicts.
+        """
+        if not self._enough or not len(self._similarities):
             return []
-        near = sorted(self._similarities.beside(pair, STRETCH))
-        if not near or self._agrees(pair):
-            return []
+        near = self._near(pair) if is_own else self._similarities.beside(pair, STRETCH)
+        return [] if not near or self._agrees(pair) else self._weak_again(near)
+
+    def on_gone(self, pair: CandidatePair) -> list[tuple[CandidatePair, float]]:
+        """The same of a closure that counts no more."""
+        return self._weak_again(self._near(pair))
+
+    def _near(self, pair: CandidatePair) -> list[CandidatePair]:
+        return self._similarities.near(pair, STRETCH)
+
+    def _weak_again(self, near: list[CandidatePair]) -> list[tuple[CandidatePair, float]]:
         again = [other for other in near if not self.is_told(other)]
         return [(other, self._similarities.pop(other) or 0.0) for other in again]
 
     def _agrees(self, closure: CandidatePair) -> bool:
         """Whether all closures beside one agree with it; one whose keyframes are not known says nothing yet."""
-        beside = self._held.beside(closure, STRETCH)
-        if not beside:
-            return True
-        return agreeing_of(self._held.foretold(closure, beside)) == len(beside)
+        foretold = self._held.foretold(closure, STRETCH)
+        return agreeing_of(foretold) == len(foretold.may_m)
 
 
 def agreeing_of(foretold: Foretold) -> int:

@@ -141,6 +141,11 @@ class WorkTable:
         """Pairs that need a latent, the most similar first."""
         return [order[1] for order in sorted(self._by_pair[pair].order for pair in self._users.get(keyframe, ()))]
 
+    def waiting(self, keyframe: KeyframeId) -> list[Order]:
+        """Pairs that need a latent and are not under way."""
+        found = (pair for pair in self._users.get(keyframe, ()) if pair not in self._registering)
+        return sorted(self._by_pair[pair].order for pair in found)
+
     def beside(self, closure: CandidatePair) -> list[Order]:
         """Pairs of the same stretches as a closure that are not under way."""
         found: set[CandidatePair] = set()

@@ -110,12 +110,22 @@ def secure_settings(tls: TlsConfig, swarm: str, robot: str) -> dict[str, Any]:
     Raises:
         TransportError: A file is missing or unreadable, or this robot is not a member of this swarm.
     """
+    members = check_member(tls, swarm, robot)
+    return tls_settings(tls) | {"access_control": access_control(swarm, members.robots, members.operators)}
+
+
+def check_member(tls: TlsConfig, swarm: str, robot: str) -> Members:
+    """Read who belongs to a swarm, and see that this robot or operator does.
+
+    Raises:
+        TransportError: The list is missing, unreadable or of another swarm, or does not name it.
+    """
     members = read_members(tls.folder / MEMBERS)
     if members.swarm != swarm:
         raise TransportError(f"{tls.folder / MEMBERS}: is of swarm {members.swarm}, not of {swarm}")
     if robot not in members.robots and robot not in members.operators:
         raise TransportError(f"{tls.folder / MEMBERS}: does not name {robot}")
-    return tls_settings(tls) | {"access_control": access_control(swarm, members.robots, members.operators)}
+    return members
 
 
 def tls_settings(tls: TlsConfig) -> dict[str, Any]:

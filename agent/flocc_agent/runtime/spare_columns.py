@@ -67,12 +67,16 @@ def spare_notes(table: Table, spare: Sequence[Name]) -> tuple[str, ...]:
     return (*left, f"{table.path}: {AIRFRAME_TOLD}") if of_airframe else left
 
 
+OWN_COMMENT = "made by flocc"
+"""How a comment begins that flocc wrote itself."""
+
+
 def comment_notes(table: Table) -> tuple[str, ...]:
     """What stands in comments and names no columns, in at most one sentence: nobody has read it."""
     said = [
         text
         for _, text in (*table.headers, *table.remarks)
-        if re.search(r"[^\W\d_]{2}", text) and not names_columns(text)
+        if re.search(r"[^\W\d_]{2}", text) and not names_columns(text) and not text.startswith(OWN_COMMENT)
     ]
     told = "; ".join(repr(text[:COMMENT_LETTERS_MAX]) for text in said[:COMMENTS_MAX])
     more = f" and {len(said) - COMMENTS_MAX} more" if len(said) > COMMENTS_MAX else ""

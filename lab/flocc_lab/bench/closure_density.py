@@ -19,7 +19,7 @@ from typing import Any
 from flocc_agent.core.pose_graph import PoseGraph
 from flocc_agent.core.spared import STRETCH
 from flocc_lab.bench.spared_closures import Replay
-from flocc_lab.measure import town
+from flocc_lab.measure import town, with_enough
 from flocc_lab.mission import leader_ate_m
 from flocc_launch.simulation.simulate import playbacks_of, swarm_of
 from flocc_protocol.messages import CandidatePair
@@ -33,7 +33,7 @@ def kept_by_density(graph: PoseGraph, enough: float) -> list[int]:
     replay, kept = Replay(graph, enough=0), list[int]()
     numbers = {CandidatePair.of(c.query, c.match): k for k, c in enumerate(graph.closures)}
     for pair in sorted(numbers, key=lambda each: (max(each.low.index, each.high.index), each)):
-        if min(replay.assembly.density(end, STRETCH) for end in (pair.low, pair.high)) < enough:
+        if min(replay.assembly.foretelling.density(end, STRETCH) for end in (pair.low, pair.high)) < enough:
             kept.append(numbers[pair])
             replay.learn(graph.closures[numbers[pair]])
     return sorted(kept)
@@ -41,7 +41,7 @@ def kept_by_density(graph: PoseGraph, enough: float) -> list[int]:
 
 def of_team(robots: int, area_m: float, minutes: float, seed: int, densities: Sequence[float]) -> dict[str, Any]:
     """One swarm."""
-    scenario = town(robots, area_m, minutes, seed).model_copy(update={"seed": seed})
+    scenario = with_enough(town(robots, area_m, minutes, seed).model_copy(update={"seed": seed}), 0)
     swarm = swarm_of(scenario, playbacks_of(scenario, {}), scenario.seed)
     swarm.run_until(60.0 * minutes)
     received = sum((traffic.received for traffic in swarm.network.traffic.values()), Counter[str]())

@@ -32,6 +32,7 @@ from flocc_lab.graph_family.family_spec import drawn
 from flocc_lab.graph_family.graphs import made
 from flocc_lab.graph_family.judge import joint_ate_m
 from flocc_lab.graph_family.methods import flocc, oracle, settings
+from flocc_lab.measure import with_enough
 from flocc_lab.mission import leader_ate_m
 from flocc_launch.graph_files import read_graph_file
 from flocc_launch.graph_files.graph_file import GraphFile, ate_m
@@ -59,7 +60,7 @@ class Replay:
     def __init__(self, graph: PoseGraph, enough: int) -> None:
         """Start without closures; `enough` that agree are enough, 0: no pair is spared."""
         self.assembly = GraphAssembly()
-        self.spared = Spared(self.assembly, enough)
+        self.spared = Spared(self.assembly.foretelling, enough)
         self._numbers: dict[LogId, int] = {}
         for log, trajectory in graph.trajectories.items():
             for k, T in enumerate(pose7s(trajectory.T_odom_keyframe)):
@@ -133,8 +134,7 @@ def of_scenario(name: str, scenario: Scenario) -> dict[str, Any]:
     """A swarm on virtual time, twice."""
     paths, closures, found = recordings(scenario), list[int](), list[float]()
     for enough in (0, ENOUGH):
-        closing = replace(scenario.core.loop_closing, closures_enough=enough)
-        changed = scenario.model_copy(update={"core": replace(scenario.core, loop_closing=closing)})
+        changed = with_enough(scenario, enough)
         swarm = swarm_of(changed, playbacks_of(changed, paths), changed.seed, cache_folder())
         run(swarm)
         leader = next(s.core for s in swarm.running() if s.core and s.core.election.leading)

@@ -102,17 +102,22 @@ def progress_bar(what: str, unit: str = "picture") -> Iterator[Callable[[int, in
 class ProgressLines:
     """Progress as lines of a log, the first of which comes only when a job takes long.
 
-    What comes before the first piece is done (workers that start) counts for no other one.
+    What comes before the first piece is done (workers that start) counts for no other one. A count that begins again is
+    that of another job, such as the next robot's.
     """
 
     def __init__(self, what: str, unit: str, clock: Callable[[], float]) -> None:
         self._what, self._unit, self._clock = what, unit, clock
         self._said_s = clock()
         self._first: tuple[float, int] | None = None
+        self._done = 0
 
     def tell(self, done: int, total: int) -> None:
         """Say how far the job is and what it will still take, if the last line is old enough."""
         now_s = self._clock()
+        if done < self._done:
+            self._first = None
+        self._done = done
         if self._first is None:
             self._first = (now_s, done) if done else None
             return

@@ -18,7 +18,7 @@ COLUMNS = (
     "neighbours",
     "keyframes",
     "closures",
-    "candidates",
+    "to register",
     "map frame",
     "sent kB",
 )

@@ -24,7 +24,7 @@ from flocc_protocol.errors import FloccError
 if TYPE_CHECKING:
     from flocc_agent.runtime.zenoh_admin import Survey
 
-OPTIONAL = frozenset({"closures", "candidates", "found", "accepted", "waiting", "lost %", "refused", "camera"})
+OPTIONAL = frozenset({"closures", "to register", "candidates", "accepted", "waiting", "lost %", "refused", "camera"})
 NO_ANSWER = "no answer"
 LEFT = frozenset({"robot", "state", "leader", "map frame", "hears", "camera"})
 
@@ -186,8 +186,8 @@ def cells_of(row: RobotStatus) -> dict[str, str]:
         "map frame": row.map_frame or "-",
         "keyframes": shown(row.keyframes),
         "closures": shown(row.closures),
-        "candidates": shown(row.candidates),
-        "found": shown(row.found),
+        "to register": shown(row.candidates),
+        "candidates": shown(row.found),
         "accepted": shown(row.accepted),
         "waiting": shown(sum(row.queues.values()) if row.queues else None),
         "lost %": f"{100 * max(row.loss.values()):.0f}" if row.loss else "-",

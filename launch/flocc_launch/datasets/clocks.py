@@ -98,13 +98,13 @@ def fit_clocks(stamps_s: Float, turns_rad: Float, trajectory: Trajectory) -> Clo
         turns_rad: (N - 1,) between neighbouring ones; nan where not known.
         trajectory: Of the body that carries the camera, by its own clock.
     """
-    turned_rad = np.concatenate([[0.0], np.cumsum(_steps_rad(trajectory))])
+    own_rad = turned_rad(trajectory)
     known = np.isfinite(turns_rad)
     if np.count_nonzero(known) < CORNERS_MIN:
         return None
     starts_s, ends_s, seen_rad = stamps_s[:-1][known], stamps_s[1:][known], turns_rad[known]
     offsets_s = _candidates_s(stamps_s, trajectory.stamps_s)
-    scores = np.array([_score(starts_s, ends_s, seen_rad, trajectory.stamps_s, turned_rad, o) for o in offsets_s])
+    scores = np.array([_score(starts_s, ends_s, seen_rad, trajectory.stamps_s, own_rad, o) for o in offsets_s])
     best = int(np.argmax(scores))
     others = scores[np.abs(offsets_s - offsets_s[best]) > NEAR_S]
     if scores[best] < CORRELATION_MIN or (len(others) and scores[best] - np.max(others) < AHEAD_MIN):
@@ -113,9 +113,7 @@ def fit_clocks(stamps_s: Float, turns_rad: Float, trajectory: Trajectory) -> Clo
     near_s = offsets_s[best] + np.arange(-NEAR_S, NEAR_S, STEP_S / 2)
     ends = []
     for half in halves:
-        part = [
-            _score(starts_s[half], ends_s[half], seen_rad[half], trajectory.stamps_s, turned_rad, o) for o in near_s
-        ]
+        part = [_score(starts_s[half], ends_s[half], seen_rad[half], trajectory.stamps_s, own_rad, o) for o in near_s]
         ends.append((float(np.mean(starts_s[half])), float(near_s[int(np.argmax(part))]), max(part)))
     told = all(score >= CORRELATION_MIN for _, _, score in ends) and ends[1][0] > ends[0][0]
     apart_s = ends[0][1] - ends[1][1]
@@ -124,10 +122,18 @@ def fit_clocks(stamps_s: Float, turns_rad: Float, trajectory: Trajectory) -> Clo
     return ClockFit(-float(offsets_s[best]), drift, float(scores[best]))
 
 
-def _steps_rad(trajectory: Trajectory) -> Float:
+def agreement(stamps_s: Float, turns_rad: Float, trajectory: Trajectory) -> float:
+    """Correlation of turns in pictures with those of a trajectory as both are stamped, at most 1; -1 where unknown."""
+    known = np.isfinite(turns_rad)
+    parts = stamps_s[:-1][known], stamps_s[1:][known], turns_rad[known]
+    return _score(*parts, trajectory.stamps_s, turned_rad(trajectory), 0.0)
+
+
+def turned_rad(trajectory: Trajectory) -> Float:
+    """(N,) radians by which the body has turned up to each pose, whatever the axes."""
     T = trajectory.T_fixed_body[:, :3, :3]
     traces = np.einsum("nij,nij->n", T[:-1], T[1:])
-    return np.asarray(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
+    return np.concatenate([[0.0], np.cumsum(np.arccos(np.clip((traces - 1) / 2, -1, 1)))])
 
 
 def _candidates_s(stamps_s: Float, own_s: Float) -> Float:
@@ -138,12 +144,12 @@ def _candidates_s(stamps_s: Float, own_s: Float) -> Float:
     return np.arange(low_s, high_s + step_s, step_s)
 
 
-def _score(starts_s: Float, ends_s: Float, seen_rad: Float, own_s: Float, turned_rad: Float, offset_s: float) -> float:
+def _score(starts_s: Float, ends_s: Float, seen_rad: Float, own_s: Float, own_rad: Float, offset_s: float) -> float:
     """Correlation of turns in the pictures with those of the trajectory at an offset."""
     inside = (starts_s + offset_s >= own_s[0]) & (ends_s + offset_s <= own_s[-1])
     if np.count_nonzero(inside) < max(CORNERS_MIN, OVERLAP_MIN_RATIO * 0.5 * len(starts_s)):
         return -1.0
-    at = [np.interp(stamps_s[inside] + offset_s, own_s, turned_rad) for stamps_s in (starts_s, ends_s)]
+    at = [np.interp(stamps_s[inside] + offset_s, own_s, own_rad) for stamps_s in (starts_s, ends_s)]
     a, b = at[1] - at[0], seen_rad[inside]
     a, b = a - a.mean(), b - b.mean()
     size = float(np.linalg.norm(a) * np.linalg.norm(b))

@@ -55,8 +55,8 @@ OFFSET_MAX_S, OFFSET_STEP_S, OFFSET_MIN_S = 2.0, 0.1, 0.15
 OFFSET_PAIRS_MIN, OFFSET_EVIDENCE_MIN = 5, 8.0
 ORDERS = {-1: ("x y z w", "w x y z", "tum-wxyz"), 1: ("w x y z", "x y z w", "tum")}
 """By how many places a quaternion's numbers move round: how they were read, how they must be, and the form's name."""
-POSED_BY_MATRICES = ("kitti", "7scenes", "colmap", "transforms", "replica")
-"""Formats without quaternions whose order a line of the file could say wrongly."""
+POSED_BY_MATRICES = ("kitti", "7scenes", "colmap", "transforms", "replica", "bag")
+"""Formats without quaternions whose order a line of the file could say wrongly; a bag's have names."""
 WAY_OUT = "flocc dataset convert --trajectory-format"
 
 
@@ -228,10 +228,12 @@ def reordered(T: Float, places: int) -> Float:
 
 def posed_pairs(source: Source, trajectory: Trajectory) -> list[PosedPair] | None:
     """Pairs of pictures between which the camera turns, from all over the recording; None where nothing can be seen."""
+    chosen, lens = chosen_pairs(source.images, trajectory), source.lens
+    if lens is None or not chosen:
+        return None
     registrar_of = build_perception(PerceptionConfig())
-    registrar, lens = registrar_of.registrar, source.lens
-    chosen = chosen_pairs(source.images, trajectory)
-    if lens is None or not chosen or not isinstance(registrar, SeesFlow):
+    registrar = registrar_of.registrar
+    if not isinstance(registrar, SeesFlow):
         return None
     try:
         straightener = Straightener(lens.camera, lens.view_rad)

@@ -27,14 +27,21 @@ def ports(config: TransportConfig) -> list[Finding]:
 
 
 def configured_network(config: TransportConfig) -> list[Finding]:
-    """Whether the interfaces and hosts that the configuration names are there."""
+    """Whether the interfaces and hosts that the configuration names are there, and its certificates hold."""
+    from flocc_agent.runtime.certificate_faults import certificate_faults
     from flocc_agent.runtime.network_faults import network_faults
 
+    keys = "Make it with 'flocc keys' where the swarm's authority is, and bring it here."
     advice = "Bring it up, or change it in [transport] of the agent's configuration; an agent goes on trying meanwhile."
+    keyless = config.model_copy(update={"tls": None})
     return [
-        Finding("network", Severity.HINDERS, f"{fault[0].upper()}{fault[1:]}.", advice)
-        for fault in network_faults(config, "")
+        *(Finding("certificate", Severity.HINDERS, _said(fault), keys) for fault in certificate_faults(config.tls)),
+        *(Finding("network", Severity.HINDERS, _said(fault), advice) for fault in network_faults(keyless, "")),
     ]
+
+
+def _said(fault: str) -> str:
+    return f"{fault[0].upper()}{fault[1:]}."
 
 
 def port_problem(host: str, port: int) -> str | None:
@@ -50,8 +57,12 @@ def port_problem(host: str, port: int) -> str | None:
 
 
 def discovery(config: TransportConfig) -> list[Finding]:
-    """Whether zenoh peers on this machine find each other: by multicast, by gossip of a third, by an endpoint."""
+    """Whether zenoh peers on this machine find each other: by multicast, by gossip of a third, by an endpoint.
+
+    Without keys: it is the machine's network that is asked, and the peers are of no swarm that a list of members names.
+    """
     found = []
+    config = config.model_copy(update={"tls": None})
     if config.multicast:
         took_s = seconds_until(lambda: two_peers(config, by_multicast=True))
         advice = (

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.measurements import OdometryCovariance
 from flocc_agent.core.reports import ClosureAccepted, MeasurementKept, PeerRefused, RoundSolved
-from flocc_agent.runtime.event_lines import UnknownFact, of_kind
+from flocc_agent.runtime.event_lines import Reported, UnknownFact, of_kind
 from flocc_agent.runtime.facts import AgentDied, BytesCounted
 from flocc_agent.stages import BOUNDS_S
 from flocc_launch.datasets.commands import ODOMETRY_MADE
@@ -278,10 +278,16 @@ HELD, HELD_TOLD_MAX = "held until another one agrees", 3
 """What the back end says of a lone closure, and how many of them a reader wants to see."""
 
 
+def _death(event: Reported[AgentDied]) -> str:
+    if event.fact.scripted:
+        return f"{event.robot} was killed after {event.t:.1f} s, as the scenario asked."
+    return f"{event.robot} died after {event.t:.1f} s ({how_it_died(event)})."
+
+
 def warnings_of(loaded: LoadedRun) -> list[str]:
     """What a reader should see: deaths, refusals, missing results, odd truths, unknown events, the solver's last."""
     events = loaded.events
-    found = [f"{e.robot} died after {e.t:.1f} s ({how_it_died(e)})." for e in of_kind(events, AgentDied)]
+    found = [_death(event) for event in of_kind(events, AgentDied)]
     found += sorted({f"{e.robot} refused {e.fact.peer}: {e.fact.reason}." for e in of_kind(events, PeerRefused)})
     for robot in loaded.robots:
         if robot not in loaded.results:

@@ -223,7 +223,9 @@ def closures(report: RunReport, loaded: LoadedRun) -> str:
     counts, heading = report.closures, element("h2", "Loop closures")
     solver = "" if counts.used is None else f" The last optimisation used {counts.used}"
     if counts.rejected_by_solver is not None and solver:
-        solver += f" and rejected {counts.rejected_by_solver} as outliers"
+        solver += f", rejected {counts.rejected_by_solver} as outliers"
+        waiting = counts.accepted - (counts.used or 0) - counts.rejected_by_solver
+        solver += f" and left out {waiting} that are held or came later" if waiting > 0 else ""
     text = (
         f"{count_of(counts.candidates)} pairs looked alike, {count_of(counts.accepted)} became closures, "
         f"{count_of(counts.rejected)} were rejected.{solver}{'.' if solver else ''}"

@@ -69,7 +69,8 @@ def make_keys(
         Each member's folder, also of those admitted earlier.
 
     Raises:
-        KeysError: The folder is of another swarm, cannot be written, or `cryptography` is not installed.
+        KeysError: The folder is of another swarm, cannot be written, lacks what its members' certificates rest on, or
+            `cryptography` is not installed.
         BadName: A name that no robot can have.
     """
     _check_installed()
@@ -82,6 +83,8 @@ def make_keys(
         for name in sorted(known_robots & {AUTHORITY, *known_operators}):
             raise KeysError(f"{folder}: no robot can be named {name!r} here")
         authority = _authority(folder / AUTHORITY, checked_name(swarm, "swarm name"), moment)
+        for name, role in sorted(names.items()):
+            _check_at_home(folder, name, members[role].get(name))
         for name, role in sorted(names.items()):
             public_key = _member_keys(folder / name, name, authority, list((addresses or {}).get(name, ())), moment)
             members[role][name] = public_key.hex()
@@ -111,15 +114,31 @@ def _members(path: Path, swarm: str) -> dict[str, dict[str, Any]]:
     """Read the members admitted so far."""
     if not path.exists():
         return {"robots": {}, "operators": {}, "compute_classes": {}}
-    content = json.loads(path.read_bytes())
-    if content["swarm"] != swarm:
-        raise KeysError(f"{path}: is of swarm {content['swarm']}, not of {swarm}")
-    operators = dict.fromkeys(content["operators"], "")
-    return {
-        "robots": content["robots"],
-        "operators": operators,
-        "compute_classes": content.get("compute_classes", {}),
-    }
+    try:
+        content = json.loads(path.read_bytes())
+        of_swarm, robots = str(content["swarm"]), {str(name): str(key) for name, key in content["robots"].items()}
+        operators = dict.fromkeys(map(checked_name, content["operators"]), "")
+        classes = {str(name): int(each) for name, each in content.get("compute_classes", {}).items()}
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise KeysError(f"{path}: is not a list of members: {error}") from error
+    if of_swarm != swarm:
+        raise KeysError(f"{path}: is of swarm {of_swarm}, not of {swarm}")
+    return {"robots": robots, "operators": operators, "compute_classes": classes}
+
+
+def _check_at_home(folder: Path, name: str, listed: str | None) -> None:
+    """See that a member's keys here are those that the list of members names: others know it by these.
+
+    Raises:
+        KeysError: They are gone, or are others.
+    """
+    path = folder / name / SIGNING_KEY
+    if listed and (not path.exists() or _signing_key(path).hex() != listed):
+        members = folder / AUTHORITY / MEMBERS
+        raise KeysError(
+            f"{path}: is not the key by which {members} knows {name}: name the new robots only, "
+            f"or delete {name} from that list to give it new keys"
+        )
 
 
 def _authority(folder: Path, swarm: str, now: datetime) -> Authority:
@@ -128,7 +147,13 @@ def _authority(folder: Path, swarm: str, now: datetime) -> Authority:
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-    if (folder / CA_KEY).exists():
+    if (folder / CA_KEY).exists() or any(folder.parent.glob(f"*/{CA}")):
+        for path in (folder / CA_KEY, folder / CA):
+            if not path.exists():
+                raise KeysError(
+                    f"{path}: is gone, and the certificates beside it rest on it: bring it back from a copy, or make "
+                    "keys for all robots in another folder"
+                )
         try:
             key = load_pem_private_key((folder / CA_KEY).read_bytes(), password=None)
             certificate = x509.load_pem_x509_certificate((folder / CA).read_bytes())
@@ -156,7 +181,7 @@ def _member_keys(folder: Path, name: str, authority: Authority, addresses: list[
     from cryptography.x509.oid import ExtendedKeyUsageOID
 
     folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / KEY).exists():
+    if not ((folder / KEY).exists() and (folder / CERTIFICATE).exists()):
         key = ec.generate_private_key(ec.SECP256R1())
         purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
         certificate = (
@@ -177,8 +202,12 @@ def _signing_key(path: Path) -> bytes:
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
     if path.exists():
-        key = load_pem_private_key(path.read_bytes(), password=None)
-        assert isinstance(key, Ed25519PrivateKey)
+        try:
+            key = load_pem_private_key(path.read_bytes(), password=None)
+        except ValueError as error:
+            raise KeysError(f"{path}: is not a private key") from error
+        if not isinstance(key, Ed25519PrivateKey):
+            raise KeysError(f"{path}: is not an Ed25519 key")
     else:
         key = Ed25519PrivateKey.generate()
         _write_private(path, _pem(key))

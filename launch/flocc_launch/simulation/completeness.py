@@ -3,7 +3,7 @@
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,8 @@ class Complete:
 
     A robot that comes back looks no more for keyframes both of which were registered with one of the other's log.
     A pair is refused unseen only by a robot that holds refusals of pairs that were seen, and one that is spared lies
-    beside as many closures as are enough: when it is spared, and in all logs of the swarm at the end.
+    beside as many closures as are enough, or third ways to which closures lead from both of its ends: when it is
+    spared, and in all logs of the swarm at the end.
     """
 
     _descriptors: dict[bytes, NDArray[np.float32]] = field(default_factory=dict)
@@ -71,7 +72,7 @@ class Complete:
 
     def _spared_too_early(self, station: Station, pair: CandidatePair) -> Iterator[str]:
         enough = core(station).closures_enough
-        beside = _closures_beside(self._held_by(station).closures, pair)
+        beside = _told_by(self._held_by(station).closures, pair)
         if not enough or beside < enough:
             yield f"{station.name} spares {pair.low} {pair.high} with {beside} closures beside it"
 
@@ -117,8 +118,8 @@ class Complete:
                     continue
                 if any(withdrawals.is_withdrawn(end) and end.log not in writers for end in (pair.low, pair.high)):
                     continue  # whoever made its latent anew is not here
-                enough = swarm.scenario.core.loop_closing.closures_enough
-                if not enough or _closures_beside(told, pair) < enough:
+                enough = core(group[0]).closures_enough
+                if not enough or _told_by(told, pair) < enough:
                     yield f"nobody registered {pair.low} {pair.high}, which look alike"
 
     def _described(self, copy: LogCopy) -> dict[int, NDArray[np.float32]]:
@@ -210,10 +211,21 @@ class _Held:
                 self.closures[pair.low.log, pair.high.log].add(pair)
 
 
-def _closures_beside(closures: ClosuresByLogs, pair: CandidatePair) -> int:
-    """Closures of the same stretches of two ways."""
+def _told_by(closures: ClosuresByLogs, pair: CandidatePair) -> int:
+    """Closures of the same stretches of two ways, and third logs that closures join with both of them at one place."""
     of_logs = closures.get((pair.low.log, pair.high.log), set())
-    return sum(is_beside(pair, other, STRETCH) for other in of_logs)
+    own = {pair.low.log, pair.high.log}
+    third = {log for logs in closures for log in logs} - own
+    ways = ((_reached(closures, pair.low, log), _reached(closures, pair.high, log)) for log in third)
+    by_way = sum(any(abs(i - j) <= 2 * STRETCH for i, j in product(*both)) for both in ways)
+    return sum(is_beside(pair, other, STRETCH) for other in of_logs) + by_way
+
+
+def _reached(closures: ClosuresByLogs, keyframe: KeyframeId, log: LogId) -> set[int]:
+    """Keyframes of another log to which closures lead from around a keyframe."""
+    logs = (min(keyframe.log, log), max(keyframe.log, log))
+    ends = ((pair.low, pair.high) if pair.low.log == log else (pair.high, pair.low) for pair in closures.get(logs, ()))
+    return {there.index for there, here in ends if abs(here.index - keyframe.index) <= STRETCH}
 
 
 def _second(values: NDArray[np.float32], but: int) -> float:

@@ -1,5 +1,6 @@
 """What data cannot decide is said: two places with as many votes. Half turns, where a cost has no slope, are left."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from flocc_lab.graph_family.methods import settings
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
-A, B = LogId("a"), LogId("b")
+A, B, C = LogId("a"), LogId("b"), LogId("c")
 KEYFRAMES = 9
 COVARIANCE = np.diag([1e-3] * 3 + [1e-2] * 3)
 
@@ -36,11 +37,11 @@ def bend() -> Float:
 WAY = bend()
 
 
-def saying(T_a_b: Float, pairs: list[tuple[int, int]]) -> list[LoopClosure]:
+def saying(T_a_b: Float, pairs: list[tuple[int, int]], a: LogId = A, b: LogId = B) -> list[LoopClosure]:
     """Metric closures that agree that robot b's way begins at a pose in robot a's."""
     return [
         LoopClosure(
-            KeyframeId(A, i), KeyframeId(B, j), inverse(WAY[i]) @ T_a_b @ WAY[j], covariance=COVARIANCE, metric=True
+            KeyframeId(a, i), KeyframeId(b, j), inverse(WAY[i]) @ T_a_b @ WAY[j], covariance=COVARIANCE, metric=True
         )
         for i, j in pairs
     ]
@@ -48,7 +49,8 @@ def saying(T_a_b: Float, pairs: list[tuple[int, int]]) -> list[LoopClosure]:
 
 def solved(closures: list[LoopClosure]) -> GraphSolution:
     edges = np.broadcast_to(COVARIANCE, (KEYFRAMES - 1, 6, 6)).copy()
-    graph = PoseGraph({log: Trajectory(WAY, edges) for log in (A, B)}, closures)
+    logs = sorted({end.log for closure in closures for end in (closure.query, closure.match)})
+    graph = PoseGraph({log: Trajectory(WAY, edges) for log in logs}, closures)
     solution = optimise(graph, BackendConfig())
     assert isinstance(solution, GraphSolution)
     return solution
@@ -84,6 +86,19 @@ def test_one_closure_more_on_one_side_is_a_tie_too_and_nothing_is_held_for_it() 
     assert [w for w in solution.warnings if "held until" in w] == []
     (sentence,) = [w for w in solution.warnings if "look the same" in w]
     assert sentence.startswith("robots a and b: 5 closures agree on the place that was taken, and 4 others on another")
+
+
+@pytest.mark.parametrize("last_first", [False, True])
+def test_a_robot_that_two_others_put_in_two_places_is_named(last_first: bool) -> None:
+    pairs = [(2 * k, 2 * k + 1) for k in range(4)]
+    by_a = saying(turned(0.3, 5.0, 30.0), pairs, A, C)
+    by_b = saying(turned(-0.9, 20.0, -40.0), pairs, B, C)
+    both = by_b + by_a if last_first else by_a + by_b
+    firm = saying(turned(0.0, 5.0), [(k, k) for k in range(KEYFRAMES)])
+    (sentence,) = [w for w in solved(firm + both).warnings if "look the same" in w]
+    said = r"robot c: 4 closures with [ab] agree on the place that was taken, and 4 others with [ab] on another"
+    assert re.match(said, sentence)
+    assert "jumps" not in sentence
 
 
 @pytest.mark.parametrize("closures", [IN_FRONT, IN_FRONT + BEHIND[:1], IN_FRONT + SCATTERED])

@@ -4,11 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from tests.agent.backend.test_backend_joining import walk
 
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import GraphSolution, LoopClosure, MeasuredFactor, PoseGraph, Trajectory, landmark
-from flocc_agent.geometry import Float, between, pose, so3_exp
+from flocc_agent.geometry import between, pose
 from flocc_agent.runtime.unmeasured_steps import after_pause
 from flocc_protocol.ids import KeyframeId, LogId
 
@@ -17,18 +18,8 @@ KEYFRAMES, CARRIED = 16, 10
 TIGHT = 1e-4 * np.eye(6)
 
 
-def walk(start_m: tuple[float, float], turn_rad: float) -> Float:
-    """Poses (N, 4, 4) in the world: a gentle curve, one metre a step."""
-    x, y = start_m
-    poses = []
-    for k in range(KEYFRAMES):
-        heading = turn_rad + 0.08 * k
-        poses.append(pose(so3_exp(np.array([0.0, 0.0, heading])), np.array([x, y, 0.0])))
-        x, y = x + np.cos(heading), y + np.sin(heading)
-    return np.array(poses)
-
-
-WORLD = {R1: walk((0.0, 0.0), 0.0), R2: walk((2.0, 1.0), 0.1), R3: walk((1.0, -2.0), 0.2)}
+STARTS = {R1: ((0.0, 0.0), 0.0), R2: ((2.0, 1.0), 0.1), R3: ((1.0, -2.0), 0.2)}
+WORLD = {log: walk(*start, steps=KEYFRAMES) for log, start in STARTS.items()}
 
 
 def odometry(log: LogId, carried: bool) -> Trajectory:

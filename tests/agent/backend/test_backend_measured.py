@@ -171,9 +171,9 @@ def farther(T_body_tag: Float) -> Float:
 @pytest.mark.parametrize(
     ("misread", "told"),
     [
-        (other_order, "though positions are right: in T_body_tag the quaternion's order is w x y z"),
-        (inverse, "though distances are right: is T_body_tag inverted"),
-        (farther, "and all have them 1.50 times as far: is a size or a unit wrong?"),
+        (other_order, "though positions are right: look at the order of T_body_tag's quaternion (w x y z)"),
+        (inverse, "though distances are right: T_body_tag may be inverted"),
+        (farther, "and all have them 1.50 times as far: a size or a unit may be wrong"),
     ],
 )
 def test_sightings_that_are_all_misread_are_one_sentence_that_says_how(

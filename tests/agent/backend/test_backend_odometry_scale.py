@@ -90,9 +90,12 @@ def test_scales_are_not_believed_that_move_or_turn_closures_away_once_they_are_a
     assert believed(before, applied)
     moved = replace(applied.estimates, scale=applied.estimates.scale + 4.0 * np.hypot(before.estimates.sigma, 0.005))
     assert not believed(before, replace(applied, estimates=moved))
-    fewer = applied.solved.weights.copy()
-    fewer[applied.posed.problem.closure_rows][:] = 0.0
-    assert not believed(before, replace(applied, solved=replace(applied.solved, weights=fewer)))
+    fewer, none = applied.solved.weights.copy(), applied.solved.weights.copy()
+    none[applied.posed.problem.closure_rows][:] = 0.0
+    fewer[applied.posed.problem.closure_rows.start] = 0.0
+    assert not believed(before, replace(applied, solved=replace(applied.solved, weights=none)))
+    assert believed(before, replace(applied, solved=replace(applied.solved, weights=fewer)))  # paid for by the others
+    assert not believed(applied, replace(applied, solved=replace(applied.solved, weights=fewer)))
 
 
 def test_true_odometry_is_left_alone_and_nobody_is_warned() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.placing import spanning
-from flocc_agent.backend.votes import votes
+from flocc_agent.backend.votes import grouped, votes_of
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution, LoopClosure, PoseGraph
 from flocc_agent.geometry import inverse, pose, so3_exp
 from flocc_lab.graph_family.family_campaign import verdict_of
@@ -37,14 +37,15 @@ def test_closures_that_agree_share_their_votes_and_wrong_ones_beside_them_take_n
     right = [said(member, 20 + k, 30 + k) for k in range(8)]
     wrong = [said(member, 20 + k, 30 + k, 0.7 * k) for k in range(1, 5)]
     closures = dict(enumerate([*right, *wrong]))
-    found = votes(member.graph.trajectories, closures, closures, settings())
+    found = votes_of(grouped(member.graph.trajectories, closures, closures, settings()))
     np.testing.assert_allclose(found, [8.0 ** (-2 / 3)] * 8 + [1.0] * 4)
 
 
 def test_places_that_are_far_from_each_other_are_two_witnesses() -> None:
     member = two_robots()
     closures = dict(enumerate([said(member, 5, 5), said(member, 50, 50)]))
-    np.testing.assert_array_equal(votes(member.graph.trajectories, closures, closures, settings()), [1.0, 1.0])
+    found = votes_of(grouped(member.graph.trajectories, closures, closures, settings()))
+    np.testing.assert_array_equal(found, [1.0, 1.0])
 
 
 def test_only_pairs_that_join_something_new_can_be_what_holds_a_part() -> None:

@@ -60,3 +60,18 @@ def test_a_table_is_bounded_and_finds_pairs_of_the_same_stretches() -> None:
     assert table.pop(pair(2, 10)) == 2
     assert table.pop(pair(2, 10)) is None
     assert len(table) == 2
+
+
+def test_a_table_of_pairs_finds_those_with_a_keyframe_of_the_same_stretch() -> None:
+    c = LogId("c")
+    table: PairTable[float] = PairTable(10)
+    across = CandidatePair(KeyframeId(B, 18), KeyframeId(c, 40))
+    within = CandidatePair(KeyframeId(A, 14), KeyframeId(A, 15))
+    for each in (pair(20, 90), across, within, pair(90, 90)):
+        table.put(each, 0.5)
+    assert table.near(pair(17, 15), 3) == [within, pair(20, 90), across]
+    assert table.near(CandidatePair(KeyframeId(c, 15), KeyframeId(c, 18)), 3) == []
+    for each in (pair(20, 90), across, within):
+        table.pop(each)
+    assert table.near(pair(17, 15), 3) == []
+    assert table.near(pair(89, 1), 3) == [pair(90, 90)]

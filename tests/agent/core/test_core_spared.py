@@ -14,11 +14,21 @@ from flocc_agent.core.loop_closing import LoopClosing, registrar_of
 from flocc_agent.core.offers import OFFER_PERIOD_S
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
-from flocc_agent.core.spared import CONTRADICTED, LOOKED_MAX, SPARED_MAX, STRETCH, TIED_MIN, Spared
+from flocc_agent.core.spared import (
+    AGREE_LENGTHS,
+    AGREE_RATIO,
+    AGREE_STEPS,
+    CONTRADICTED,
+    LOOKED_MAX,
+    SPARED_MAX,
+    STRETCH,
+    TIED_MIN,
+    Spared,
+)
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidateOffer, CandidatePair
-from flocc_protocol.records import ClosureRecord, KeyframeRecord
+from flocc_protocol.records import ClosureRecord, KeyframeRecord, WithdrawalRecord
 
 R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
 KEYFRAMES = 40
@@ -37,16 +47,17 @@ class Road:
     A third one's closures tie their ways, so that these are not weak.
     """
 
-    def __init__(self, keyframes: int = KEYFRAMES, tied: int = 2) -> None:
+    def __init__(self, keyframes: int = KEYFRAMES, tied: int = 1) -> None:
         self.assembly = GraphAssembly()
-        self.spared = Spared(self.assembly, ENOUGH)
+        self.foretelling = self.assembly.foretelling
+        self.spared = Spared(self.foretelling, ENOUGH)
         self._numbers: dict[LogId, int] = {}
         for log in (R1, R2):
             for k in range(keyframes):
                 self.drives(log, k)
             for k in range(tied * KEYFRAMES):
                 T = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-                ends = KeyframeId(log, k // tied), KeyframeId(R3, k)
+                ends = KeyframeId(log, k % KEYFRAMES), KeyframeId(R3, k)
                 self._add(R3, ClosureRecord(*ends, T, 60, 100, 0.6, 1.0))
 
     def drives(self, log: LogId, k: int, jump_m: float = 0.0) -> None:
@@ -65,10 +76,14 @@ class Road:
         T = (low - high, -APART_M, 0.0, 1.0, 0.0, 0.0, 0.0)
         self._add(R2, ClosureRecord(KeyframeId(R2, high), KeyframeId(R1, low), T, 60, 100, 0.6, 1.0))
 
-    def _add(self, log: LogId, record: KeyframeRecord | ClosureRecord) -> None:
+    def withdraws(self, log: LogId, index: int) -> list[CandidatePair]:
+        """A robot takes a keyframe back; pairs of the closures that count no more."""
+        return self._add(log, WithdrawalRecord(log, index, index + 1, is_final=True))
+
+    def _add(self, log: LogId, record: KeyframeRecord | ClosureRecord | WithdrawalRecord) -> list[CandidatePair]:
         number = self._numbers.get(log, 0)
         self._numbers[log] = number + 1
-        self.assembly.add(NewRecord(log, number, record))
+        return self.assembly.add(NewRecord(log, number, record))
 
 
 def test_a_pair_is_told_by_enough_closures_of_its_stretches() -> None:
@@ -81,16 +96,16 @@ def test_a_pair_is_told_by_enough_closures_of_its_stretches() -> None:
     assert road.spared.is_told(pair(last, last))
     assert not road.spared.is_told(pair(last + 1, last))
     assert not road.spared.is_told(pair(last, 12 - STRETCH))
-    assert not Spared(road.assembly, 0).is_told(pair(12, 12))
+    assert not Spared(road.foretelling, 0).is_told(pair(12, 12))
 
 
 def test_a_stretch_with_few_closures_in_all_is_weak() -> None:
-    road = Road(tied=1)
+    road = Road(tied=0)
     for k in range(ENOUGH):
         road.closes(10 + k, 11 + k)
     assert not road.spared.is_told(pair(12, 12))
     keyframes = 2 * STRETCH + 1
-    for k in range(int(TIED_MIN) * keyframes - keyframes - ENOUGH):
+    for k in range(int(TIED_MIN * keyframes) - ENOUGH):
         assert not road.spared.is_told(pair(12, 12))
         road.closes(9, 7 + k)
     assert road.spared.is_told(pair(12, 12))
@@ -111,9 +126,8 @@ def test_what_closures_foretell_is_what_a_registration_would_find() -> None:
     for k in (10, 12):
         road.closes(k, k + 1)
     road.closes_backwards(14, 13)
-    beside = road.assembly.beside(pair(11, 12), STRETCH)
-    assert beside == [pair(10, 11), pair(12, 13), pair(14, 13)]
-    found = road.assembly.foretold(pair(11, 12), beside)
+    road.closes(11 - STRETCH - 1, 12)
+    found = road.foretelling.foretold(pair(11, 12), STRETCH)
     assert found.T_low_high == pytest.approx(np.array([[[1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 0], [0, 0, 0, 1]]] * 3))
 
 
@@ -135,8 +149,8 @@ def test_a_closure_without_a_length_or_that_does_not_agree_or_is_not_known_is_no
     adds(road)
     assert not road.spared.is_told(pair(12, 12))
     road.closes(11, 11)
-    contradicted = road.assembly.beside(pair(12, 12), STRETCH)
-    assert road.spared.is_told(pair(12, 12)) == (len(contradicted) == ENOUGH)
+    contradicted = road.foretelling.foretold(pair(12, 12), STRETCH)
+    assert road.spared.is_told(pair(12, 12)) == (len(contradicted.may_m) == ENOUGH)
 
 
 def test_odometry_that_tears_closures_apart_leaves_a_stretch_weak() -> None:
@@ -160,12 +174,13 @@ def test_each_closure_that_contradicts_takes_others_that_agree() -> None:
     assert road.spared.is_told(pair(12, 12))
 
 
-def machine(road: Road, own: LogId = R1) -> LoopClosing:
+def machine(road: Road, own: LogId = R1, held: tuple[LogId, ...] = (R1, R2)) -> LoopClosing:
     def odometry_pair(k: KeyframeId) -> tuple[KeyframeId, Pose7] | None:
         return (KeyframeId(k.log, k.index - 1), (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)) if k.index else None
 
-    closing = LoopClosing(own, 0, odometry_pair, LoopClosingParameters(closures_enough=ENOUGH), held=road.assembly)
-    for log in (R1, R2):
+    parameters = LoopClosingParameters(closures_enough=ENOUGH, sparing_logs_min=3)
+    closing = LoopClosing(own, 0, odometry_pair, parameters, held=road.foretelling)
+    for log in held:
         for k in range(KEYFRAMES):
             closing.on_held(KeyframeId(log, k))
     return closing
@@ -203,6 +218,15 @@ def test_a_pair_that_tells_nothing_new_is_not_registered_and_said_once() -> None
     assert not closing.on_candidates([Candidate(candidate, 0.9)], 1.0), "it is known"
     closing.on_offer(CandidateOffer((candidate,), transferred=True), 1.0)
     assert not closing.open_pairs()
+
+
+def test_a_small_team_registers_all_pairs() -> None:
+    road = Road()
+    for k in range(ENOUGH):
+        road.closes(10 + k, 11 + k)
+    assert road.foretelling.logs() == 3
+    assert Spared(road.foretelling, ENOUGH, logs_min=3).is_told(pair(12, 12))
+    assert not Spared(road.foretelling, ENOUGH, logs_min=4).is_told(pair(12, 12))
 
 
 def test_what_waits_is_spared_when_closures_come_and_what_is_under_way_is_not() -> None:
@@ -272,7 +296,181 @@ def test_tables_are_bounded() -> None:
     assert road.spared.sizes()["spared"] == (SPARED_MAX, SPARED_MAX)
     assert pair(0, 0) not in road.spared
     assert pair(SPARED_MAX, SPARED_MAX) in road.spared
+    for k in range(KEYFRAMES):
+        road.drives(R3, k)
     for k in range(4):
         road.closes(10 + k, 10 + k, off_m=20.0 * k)
     assert not road.spared.is_told(pair(12, 12))
     assert road.spared.sizes()["weak"] == (1, LOOKED_MAX)
+
+
+class Crowd(Road):
+    """The same road, and others that drive between the two, half a metre from each."""
+
+    def __init__(self, others: int = 1) -> None:
+        super().__init__()
+        self.others = [LogId(f"s{k}") for k in range(others)]
+        for log in self.others:
+            for k in range(KEYFRAMES):
+                self.drives(log, k)
+
+    def meets(self, log: LogId, one: KeyframeId, at: int = 12, off_m: float = 0.0) -> CandidatePair:
+        """A closure of another one with the first or the second."""
+        T = (float(at - one.index), (0.5 if one.log == R1 else -0.5) + off_m, 0.0, 1.0, 0.0, 0.0, 0.0)
+        self._add(log, ClosureRecord(one, KeyframeId(log, at), T, 60, 100, 0.6, 1.0))
+        return CandidatePair.of(one, KeyframeId(log, at))
+
+    def meets_both(self, log: LogId, low: int, high: int, off_m: float = 0.0) -> list[CandidatePair]:
+        return [self.meets(log, KeyframeId(R1, low), off_m=off_m), self.meets(log, KeyframeId(R2, high))]
+
+    def foretold(self) -> int:
+        return len(self.foretelling.foretold(pair(12, 12), STRETCH).may_m)
+
+
+def test_a_third_log_foretells_what_a_registration_would_find() -> None:
+    road = Crowd()
+    (s0,) = road.others
+    road.meets(s0, KeyframeId(R1, 10), at=8)
+    road.meets(s0, KeyframeId(R2, 14), at=13)
+    found = road.foretelling.foretold(pair(12, 13), STRETCH)
+    assert found.T_low_high == pytest.approx(np.array([[[1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 0], [0, 0, 0, 1]]]))
+    closures = AGREE_LENGTHS * (math.hypot(2.0, 0.5) + math.hypot(1.0, 0.5))
+    assert found.may_m == pytest.approx([closures + AGREE_RATIO * (2.0 + 5.0 + 1.0) + AGREE_STEPS])
+
+
+def test_a_third_log_is_one_witness_and_only_where_it_saw_both_at_one_place() -> None:
+    road = Crowd()
+    (s0,) = road.others
+    road.meets(s0, KeyframeId(R1, 12), at=1)
+    road.meets(s0, KeyframeId(R2, 12), at=2 * STRETCH + 2)
+    assert not road.foretold()
+    road.meets(s0, KeyframeId(R2, 12), at=2 * STRETCH + 1)
+    assert road.foretold() == 1
+    road.meets_both(s0, 11, 13)
+    assert road.foretold() == 1
+    road.meets(LogId("s9"), KeyframeId(R1, 12))
+    road.meets(LogId("s9"), KeyframeId(R2, 12))
+    assert road.foretold() == 1, "its odometry is not known"
+
+
+def test_third_logs_and_direct_closures_are_enough_together() -> None:
+    road = Crowd(others=2)
+    road.closes(12, 13)
+    for log in road.others:
+        assert not road.spared.is_told(pair(12, 12))
+        road.meets_both(log, 11, 11)
+    assert road.spared.is_told(pair(12, 12))
+
+
+def test_a_third_log_that_contradicts_takes_others_that_agree() -> None:
+    road = Crowd(others=1 + ENOUGH + CONTRADICTED)
+    wrong, *others = road.others
+    road.meets_both(wrong, 12, 12, off_m=9.0)
+    for log in others:
+        assert not road.spared.is_told(pair(12, 12))
+        road.meets_both(log, 12, 12)
+    assert road.spared.is_told(pair(12, 12))
+
+
+def test_what_is_foretold_does_not_depend_on_the_order_in_which_records_came() -> None:
+    told = []
+    for order in (1, -1):
+        road = Crowd(others=3)
+        for log in road.others[::order]:
+            for k in range(11, 14)[::order]:
+                road.meets_both(log, k, 24 - k, off_m=0.01 * k)
+        for k in range(10, 15)[::order]:
+            road.closes(k, k + 1, off_m=0.01 * k)
+        told.append(road.foretelling.foretold(pair(12, 12), STRETCH))
+    assert len(told[0].may_m) == 8
+    assert np.array_equal(told[0].T_low_high, told[1].T_low_high)
+    assert np.array_equal(told[0].may_m, told[1].may_m)
+
+
+def test_what_third_logs_tell_meanwhile_is_neither_fetched_nor_registered() -> None:
+    road = Crowd(others=ENOUGH)
+    closing, candidate = machine(road), of_r1()[0]
+    closing.on_candidates([Candidate(candidate, 0.9)], 0.0)
+    for log in road.others:
+        for each in road.meets_both(log, 12, 12):
+            closing.on_closure(each, 0.0)
+    assert not closing.tick(0.0)
+    assert closing.take_told() == [candidate]
+    assert not closing.open_pairs()
+
+    lacking = machine(road, held=(R1,))
+    lacking.on_peer("r2", Peer(0, log=R2))
+    lacking.on_candidates([Candidate(candidate, 0.9)], 0.0)
+    assert not lacking.tick(0.0)
+
+
+def test_pairs_are_taken_up_again_where_what_third_logs_say_counts_no_more() -> None:
+    road = Crowd(others=ENOUGH)
+    closing, candidate = machine(road), of_r1()[0]
+    closures = [each for log in road.others for each in road.meets_both(log, 12, 12)]
+    for each in closures:
+        closing.on_closure(each, 0.0)
+    closing.on_candidates([Candidate(candidate, 0.9)], 0.0)
+    assert closing.take_told() == [candidate]
+    gone = road.withdraws(road.others[0], 12)
+    assert gone == closures[:2]
+    for each in gone:
+        closing.on_withdrawn(each, 1.0)
+    assert candidate in closing.open_pairs()
+
+
+def test_pairs_that_third_logs_told_are_taken_up_again_where_a_closure_contradicts() -> None:
+    road = Crowd(others=ENOUGH)
+    closing, candidate = machine(road), of_r1()[0]
+    for log in road.others:
+        for each in road.meets_both(log, 12, 12):
+            closing.on_closure(each, 0.0)
+    closing.on_candidates([Candidate(candidate, 0.9)], 0.0)
+    assert closing.take_told() == [candidate]
+    learns(closing, road, [(13, 13)])
+    assert not closing.open_pairs()
+    learns(closing, road, [(13, 10)], off_m=20.0, now=1.0)
+    assert closing.open_pairs() == [candidate]
+
+
+@pytest.mark.parametrize("is_spared", [False, True])
+def test_a_pair_that_is_asked_for_is_registered_whatever_others_tell(is_spared: bool) -> None:
+    road = Road()
+    closing, candidate = machine(road), of_r1()[0]
+    learns(closing, road, TELLING)
+    if is_spared:
+        closing.on_candidates([Candidate(candidate, 0.9)], 0.0)
+    closing.on_asked([Candidate(candidate, 0.9)], 0.0)
+    assert registered(closing.tick(0.0)) == [candidate]
+
+
+def test_a_pair_that_is_asked_for_is_not_offered_for_ever_to_a_stronger_robot_that_spares_it() -> None:
+    road = Road()
+    closing, candidate = machine(road), of_r1()[0]
+    closing.on_peer("r9", Peer(5, log=LogId("r9")))
+    closing.on_asked([Candidate(candidate, 0.9)], 0.0)
+    assert [type(effect) for effect in closing.tick(0.0)] == [Unicast]
+    learns(closing, road, TELLING)
+    assert not closing.tick(OFFER_PERIOD_S)
+    assert not closing.open_pairs()
+
+
+def test_a_pair_is_looked_at_again_when_keyframes_of_closures_become_known() -> None:
+    road = Crowd()
+    others = [LogId(f"u{k}") for k in range(ENOUGH)]
+    for log in others:
+        road.meets_both(log, 12, 12)
+        for k in range(12):
+            road.drives(log, k)
+    assert not road.spared.is_told(pair(12, 12))
+    for log in others:
+        road.drives(log, 12)
+    assert road.spared.is_told(pair(12, 12))
+
+
+def test_a_pair_whose_record_does_not_reach_who_waits_for_it_is_registered_again_whatever_others_tell() -> None:
+    road = Road()
+    closing, candidate = machine(road), of_r1()[0]
+    learns(closing, road, [*TELLING, (candidate.low.index, candidate.high.index)])
+    closing.do_again(candidate)
+    assert registered(closing.tick(0.0)) == [candidate]

@@ -7,6 +7,7 @@ import pytest
 
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_agent.runtime.trajectory_text import read_trajectory
+from flocc_launch.runs.ground_truth import MADE
 
 COUNT = 10
 POSE = "timestamp,x,y,z,qx,qy,qz,qw"
@@ -68,6 +69,8 @@ def test_a_comment_that_nobody_reads_is_told_and_one_that_names_columns_is_not(t
     text = table("vx", lambda _: 0).replace(POSE + ",vx", f"# frame: NED, body FRD\n# {POSE},vx")
     assert any(note.endswith("comments that were not used: 'frame: NED, body FRD'") for note in read(tmp_path, text))
     assert len(read(tmp_path, text)) == 2
+    own = text.replace("frame: NED, body FRD", MADE.strip("# \n"))
+    assert not any("comments" in note for note in read(tmp_path, own)), "flocc knows what it wrote itself"
 
 
 @pytest.mark.parametrize("said", ["# positions in millimetres", "# kapture format: 1.1"])
