@@ -4,15 +4,13 @@ import logging
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from flocc_agent.lenses import CameraModel, LensKind
 from flocc_agent.runtime.pictures import FULL
-from flocc_agent.runtime.quaternion_order import rotations
-from flocc_agent.runtime.recording import MASK, read_camera, read_image_list, read_mask
+from flocc_agent.runtime.recording import MASK, read_mask
 from flocc_agent.runtime.straightening import Straightener
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
@@ -27,7 +25,7 @@ from flocc_launch.datasets.drift import DriftKind, DriftSpec, drifted, fitted, k
 from flocc_launch.datasets.names import robot_names
 from flocc_launch.datasets.picture_check import seen_faults
 from flocc_launch.datasets.plain import ODOMETRY_STEMS, TRUTH_STEMS, expected_files, taken_file
-from flocc_launch.datasets.source import DatasetError, Lens, Source
+from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.unread import unused
 from flocc_launch.datasets.video import (
     WHAT_ODOMETRY,
@@ -55,8 +53,6 @@ COUNTS_FOR = {
     "--time-offset": ("folder",),
 }
 """Options of `convert` that say something of some kinds of sources only."""
-SEEN_BYTES_MAX = 1 << 20
-"""A TUM file of about eight thousand poses."""
 ODOMETRY_MADE = "odometry_made.txt"
 """In a recording: how its odometry was made of ground truth."""
 
@@ -379,9 +375,7 @@ def convert(
             robot=robot,
             view_rad=None if view_deg is None else math.radians(view_deg),
         )
-        convert_bag(path, out, options, progress)
-        _see_recordings(out)
-        return out
+        return convert_bag(path, out, options, progress)
     if kind == "video":
         view_rad = None if view_deg is None else math.radians(view_deg)
         for note in convert_video(path, out, camera, odometry, form, every, progress, view_rad):
@@ -515,27 +509,6 @@ def _see_pictures(source: Source, given: Trajectory | None, is_settled: bool) ->
     trajectory = given or source.odometry or source.truth
     if trajectory is not None:
         _log(seen_faults(source, trajectory, is_settled))
-
-
-def _every(path: Path) -> int:
-    """Which rows of a recording's odometry the pictures are held against: few thousands say as much as all."""
-    return max(1, path.stat().st_size // SEEN_BYTES_MAX)
-
-
-def _see_recordings(out: Path) -> None:
-    """Log what pictures contradict of the odometry of a bag's recordings, of one robot or of several."""
-    folders = [out] if (out / "images.txt").exists() else sorted(file.parent for file in out.glob("*/images.txt"))
-    for folder in folders:
-        try:
-            images = tuple(read_image_list(folder / "images.txt"))
-            with (folder / "odometry.tum").open(encoding="utf-8") as lines:
-                rows = np.loadtxt(islice(lines, 0, None, _every(folder / "odometry.tum")), comments="#", ndmin=2)
-            T = np.tile(np.eye(4), (len(rows), 1, 1))
-            T[:, :3, :3], T[:, :3, 3] = rotations(rows[:, [7, 4, 5, 6]]), rows[:, 1:4]
-            odometry, lens = Trajectory(rows[:, 0], T), Lens(*read_camera(folder / "camera.toml"))
-        except (FloccError, OSError, ValueError, IndexError):  # without images or poses, as an agent will say
-            continue
-        _see_pictures(Source(folder, "bag", images, lens), odometry, True)
 
 
 def _seen(source: Source, is_settled: bool) -> tuple[str, ...]:
