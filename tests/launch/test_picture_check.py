@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.launch.bag_fixtures import ZERO_NS, BagScript
 
 from flocc_agent.geometry import pose, q_wxyz_from_R, so3_exp
 from flocc_agent.runtime.trajectory import Trajectory
@@ -99,18 +98,3 @@ def test_a_trajectory_of_another_clock_is_told(later_s: float, told: str | None)
     assert source.odometry is not None
     faults = seen_faults(source, source.odometry.later(later_s))
     assert (len(faults) == 0) if told is None else (told in faults[0] and "flocc dataset clock" in faults[0])
-
-
-@pytest.mark.data
-@needs_street
-def test_a_bag_of_another_clock_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    source, script = read_source(STREET), BagScript(ros1=True)
-    assert source.odometry is not None
-    for stamp_s, file in source.images:
-        script.jpeg("/cam/image/compressed", round(stamp_s * 1e9) + ZERO_NS, file.read_bytes())
-    for stamp_s, T in zip(source.odometry.stamps_s, source.odometry.T_fixed_body, strict=True):
-        w, x, y, z = q_wxyz_from_R(T[:3, :3]).tolist()
-        script.odometry("/odom", round((stamp_s + 0.5) * 1e9) + ZERO_NS, float(T[0, 3]), (x, y, z, w))
-    script.messages.sort(key=lambda message: message[2])
-    convert(script.write(tmp_path / "run.bag"), tmp_path / "out", camera=STREET / "intrinsics.yaml")
-    assert "the trajectory turns about 0.5 s later than the pictures do" in caplog.text

@@ -10,7 +10,7 @@ import numpy as np
 
 from flocc_agent.lenses import CameraModel, LensKind
 from flocc_agent.runtime.pictures import FULL
-from flocc_agent.runtime.recording import MASK, read_camera, read_image_list, read_mask
+from flocc_agent.runtime.recording import MASK, read_mask
 from flocc_agent.runtime.straightening import Straightener
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
@@ -25,7 +25,7 @@ from flocc_launch.datasets.drift import DriftKind, DriftSpec, drifted, fitted, k
 from flocc_launch.datasets.names import robot_names
 from flocc_launch.datasets.picture_check import seen_faults
 from flocc_launch.datasets.plain import ODOMETRY_STEMS, TRUTH_STEMS, expected_files, taken_file
-from flocc_launch.datasets.source import DatasetError, Lens, Source
+from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.truth_clock import truth_faults
 from flocc_launch.datasets.unread import unused
 from flocc_launch.datasets.video import (
@@ -376,9 +376,7 @@ def convert(
             robot=robot,
             view_rad=None if view_deg is None else math.radians(view_deg),
         )
-        convert_bag(path, out, options, progress)
-        _see_recordings(out)
-        return out
+        return convert_bag(path, out, options, progress)
     if kind == "video":
         view_rad = None if view_deg is None else math.radians(view_deg)
         for note in convert_video(path, out, camera, odometry, form, every, progress, view_rad):
@@ -512,19 +510,6 @@ def _see_pictures(source: Source, given: Trajectory | None, is_settled: bool) ->
     trajectory = given or source.odometry or source.truth
     if trajectory is not None:
         _log((*seen_faults(source, trajectory, is_settled), *truth_faults(source, trajectory)))
-
-
-def _see_recordings(out: Path) -> None:
-    """Log what pictures contradict of the odometry of a bag's recordings, of one robot or of several."""
-    folders = [out] if (out / "images.txt").exists() else sorted(file.parent for file in out.glob("*/images.txt"))
-    for folder in folders:
-        try:
-            images = tuple(read_image_list(folder / "images.txt"))
-            odometry = read_trajectory(folder / "odometry.tum")[0]
-            lens = Lens(*read_camera(folder / "camera.toml"))
-        except FloccError:  # without images or poses, as an agent will say
-            continue
-        _see_pictures(Source(folder, "bag", images, lens), odometry, True)
 
 
 def _seen(source: Source, is_settled: bool) -> tuple[str, ...]:

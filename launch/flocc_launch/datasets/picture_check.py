@@ -55,8 +55,8 @@ OFFSET_MAX_S, OFFSET_STEP_S, OFFSET_MIN_S = 2.0, 0.1, 0.15
 OFFSET_PAIRS_MIN, OFFSET_EVIDENCE_MIN = 5, 8.0
 ORDERS = {-1: ("x y z w", "w x y z", "tum-wxyz"), 1: ("w x y z", "x y z w", "tum")}
 """By how many places a quaternion's numbers move round: how they were read, how they must be, and the form's name."""
-POSED_BY_MATRICES = ("kitti", "7scenes", "colmap", "transforms", "replica", "bag")
-"""Formats without quaternions whose order a line of the file could say wrongly; a bag's have names."""
+POSED_BY_MATRICES = ("kitti", "7scenes", "colmap", "transforms", "replica")
+"""Formats without quaternions whose order a line of the file could say wrongly."""
 WAY_OUT = "flocc dataset convert --trajectory-format"
 
 
