@@ -11,20 +11,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.measurements import MetricClosure, PoseFix, RobotSighting, TagSighting
+from flocc_agent.core.measurements import WHOLE_POSES
 from flocc_agent.core.pose_graph import ClosureState, Component, FactorResult
 from flocc_agent.geometry import between
 from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
 
-KINDS = {
-    TagSighting.kind: ("sightings of tags", "T_body_tag"),
-    RobotSighting.kind: ("sightings of robots", "T_body_robot"),
-    PoseFix.kind: ("poses in the world", "T_world_body"),
-    MetricClosure.kind: ("closures of its own", "T_query_match"),
-}
-"""What measurements of a whole pose are called, and the pose that is written down."""
 MISREAD_MIN = 3
 """Fewer may all be wrong by themselves."""
 MISREAD_RATIO = 0.8
@@ -40,14 +33,14 @@ def misread(results: Sequence[FactorResult], components: Sequence[Component]) ->
     """One sentence for each robot and kind of which next to nothing is used, by the number of each such result."""
     by_kind: dict[tuple[LogId, str], list[int]] = defaultdict(list)
     for k, result in enumerate(results):
-        if result.factor.kind in KINDS and result.factor.has_rotation:
+        if result.factor.kind in WHOLE_POSES and result.factor.has_rotation:
             by_kind[result.factor.at.log, result.factor.kind].append(k)
     component_of = {log: component for component in components for log in component.logs}
     told: dict[int, str] = {}
     for (log, kind), every in sorted(by_kind.items()):
         refused = [k for k in every if results[k].state is not ClosureState.USED]
         if len(refused) >= max(MISREAD_MIN, MISREAD_RATIO * len(every)):
-            what, field = KINDS[kind]
+            what, field = WHOLE_POSES[kind]
             count = f"none of the {len(every)}" if len(refused) == len(every) else f"only {len(every) - len(refused)}"
             of_all = "" if len(refused) == len(every) else f" of the {len(every)}"
             common = _in_common([results[k] for k in refused], component_of, field)

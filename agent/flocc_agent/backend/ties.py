@@ -64,7 +64,7 @@ def tie_warnings(
             for rows in (by_pair.setdefault((a, b), []), by_log.setdefault(a, []), by_log.setdefault(b, [])):
                 rows.append(n)
 
-    def tie(rows: list[int], log: LogId) -> Tie | None:
+    def tie(rows: list[int], log: LogId) -> TwoPlaces | None:
         """Where the rejected ones of some closures (rows) put a log, if they agree."""
         followed, rejected = [n for n in rows if used[n]], [n for n in rows if not used[n]]
         enough = max(NEARLY_RATIO * len(followed), REJECTED_MIN)
@@ -81,7 +81,7 @@ def tie_warnings(
         if moved_m <= TRANSLATION_TOLERANCE_M and turned_rad <= ROTATION_TOLERANCE_RAD:
             return None
         taken = [_towards(log, closures[problem.closure_ids[n]]) for n in followed]
-        return Tie(taken, [placed[k] for k in found.agreeing], moved_m, float(np.degrees(turned_rad)))
+        return TwoPlaces(taken, [placed[k] for k in found.agreeing], moved_m, float(np.degrees(turned_rad)))
 
     ties = [(pair, found) for pair, rows in sorted(by_pair.items()) if (found := tie(rows, pair[1])) is not None]
     sentences = [f"robots {a.robot} and {b.robot}: {found.sentence()}" for (a, b), found in ties]
@@ -99,7 +99,7 @@ def tie_warnings(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tie:
+class TwoPlaces:
     """Closures that agree on the place that was taken, and others on another one.
 
     Attributes:
@@ -143,7 +143,7 @@ def _towards(log: LogId, closure: LoopClosure) -> tuple[KeyframeId, KeyframeId]:
     return (closure.query, closure.match) if closure.match.log == log else (closure.match, closure.query)
 
 
-def _or_jumped(tie: Tie) -> str:
+def _or_jumped(tie: TwoPlaces) -> str:
     """What else it may be, where all keyframes of one place come before all of the other, in one robot's log."""
     for side in (0, 1):
         log = tie.others[0][side].log

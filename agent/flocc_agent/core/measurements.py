@@ -359,6 +359,14 @@ Measurement = (
     | OdometryCovariance
 )
 
+WHOLE_POSES = {
+    TagSighting.kind: ("sightings of tags", "T_body_tag"),
+    RobotSighting.kind: ("sightings of robots", "T_body_robot"),
+    PoseFix.kind: ("poses in the world", "T_world_body"),
+    MetricClosure.kind: ("closures of its own", "T_query_match"),
+}
+"""By kind: what measurements of a whole pose are called together, and the pose of each."""
+
 
 def _check_pose(kind: str, T: Float) -> None:
     T = np.asarray(T, dtype=float)

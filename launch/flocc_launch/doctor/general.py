@@ -19,7 +19,7 @@ from flocc_agent.runtime.event_lines import Reported, of_kind
 from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.doctor.cameras import doubted_cameras
 from flocc_launch.doctor.finding import APART_ADVICE, Finding, Severity
-from flocc_launch.doctor.gravity import odd_up
+from flocc_launch.doctor.odometry_up import odd_up
 from flocc_launch.runs.alike_places import ADVICE
 from flocc_launch.runs.closure_table import Pair
 from flocc_launch.runs.ground_truth import frame_sentences, other_clocks

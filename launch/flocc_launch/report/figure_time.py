@@ -29,7 +29,7 @@ LANE_PX = 17.0
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
+class Bar:
     """A coloured bar in a row."""
 
     from_s: float
@@ -45,8 +45,8 @@ class Row:
 
     name: str
     class_: str
-    spans: Sequence[Span]
-    below: Sequence[Span] | None = None
+    spans: Sequence[Bar]
+    below: Sequence[Bar] | None = None
 
 
 def time_figure(loaded: LoadedRun, report: RunReport) -> str:
@@ -96,7 +96,7 @@ def draw_row(row: Row, axis: Axis, y: float) -> str:
     return name + rail + above + "".join(draw_span(span, axis, y + half + 1, half) for span in row.below)
 
 
-def draw_span(span: Span, axis: Axis, y: float, height: float) -> str:
+def draw_span(span: Bar, axis: Axis, y: float, height: float) -> str:
     """One bar, with its label where there is room."""
     x, width = axis(span.from_s), max(axis(span.to_s) - axis(span.from_s), 1.5)
     bar = element("rect", x=x, y=y, width=width, height=height, rx=2, class_="span")
@@ -111,7 +111,7 @@ def frame_rows(loaded: LoadedRun) -> list[Row]:
     return [Row(robot, colour(names, robot), frame_spans(loaded, robot)) for robot in names]
 
 
-def frame_spans(loaded: LoadedRun, robot: str) -> list[Span]:
+def frame_spans(loaded: LoadedRun, robot: str) -> list[Bar]:
     """Stretches of one robot in one map frame; a robot that died is in none."""
     changes: list[tuple[float, str | None]] = []
     for event in loaded.events:
@@ -123,7 +123,7 @@ def frame_spans(loaded: LoadedRun, robot: str) -> list[Span]:
     for (from_s, frame), (to_s, _) in pairwise([*changes, (loaded.end_s, None)]):
         if frame is not None:
             said = f"{robot} in {frame}: {seconds(from_s)} to {seconds(to_s)}"
-            spans.append(Span(from_s, to_s, colour(loaded.robots, anchor_of(frame)), frame, said))
+            spans.append(Bar(from_s, to_s, colour(loaded.robots, anchor_of(frame)), frame, said))
     return spans
 
 
@@ -141,7 +141,7 @@ def leader_rows(loaded: LoadedRun) -> list[Row]:
     rows = []
     for robot in loaded.robots:
         spans = [
-            Span(
+            Bar(
                 span.from_s, span.to_s, colour(loaded.robots, span.leader), span.leader,
                 f"{robot} followed {span.leader} (term {span.term}): {seconds(span.from_s)} to {seconds(span.to_s)}",
             )
@@ -163,16 +163,16 @@ def link_rows(loaded: LoadedRun) -> list[Row]:
     ]
 
 
-def link_spans(links: Iterable[Link], robot: str, peer: str, class_: str) -> list[Span]:
+def link_spans(links: Iterable[Link], robot: str, peer: str, class_: str) -> list[Bar]:
     """When one robot heard one other."""
     return [
-        Span(k.from_s, k.to_s, class_, "", f"{robot} heard {peer}: {seconds(k.from_s)} to {seconds(k.to_s)}")
+        Bar(k.from_s, k.to_s, class_, "", f"{robot} heard {peer}: {seconds(k.from_s)} to {seconds(k.to_s)}")
         for k in links
         if (k.robot, k.peer) == (robot, peer)
     ]
 
 
-def heard_by(loaded: LoadedRun, robot: str) -> list[Span]:
+def heard_by(loaded: LoadedRun, robot: str) -> list[Bar]:
     """How many neighbours one robot heard, as bars with their count."""
     mine = [link for link in loaded.links if link.robot == robot]
     times = sorted({link.from_s for link in mine} | {link.to_s for link in mine})
@@ -180,7 +180,7 @@ def heard_by(loaded: LoadedRun, robot: str) -> list[Span]:
     for from_s, to_s in pairwise(times):
         heard = sum(link.from_s <= from_s and to_s <= link.to_s for link in mine)
         if heard:
-            spans.append(Span(from_s, to_s, "c7", str(heard), f"{robot} heard {heard} robots"))
+            spans.append(Bar(from_s, to_s, "c7", str(heard), f"{robot} heard {heard} robots"))
     return spans
 
 
