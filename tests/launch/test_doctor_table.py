@@ -38,7 +38,7 @@ PAGE = Path(__file__).parents[2] / "docs/doctor.md"
 HELD_CLOSURE = f"closure r1/3 - r2/5: {SECOND_PLACE}of 5 places where r1 and r2 would be side by side 3 do not match"
 KINDS = {"well": Severity.GOOD, "blocks": Severity.BLOCKS, "hinders": Severity.HINDERS, "note": Severity.NOTE}
 OF = {
-    "run": ("diagnose", "steps", "held_joins", "general", "cameras", "gravity"),
+    "run": ("diagnose", "steps", "held_joins", "general", "cameras", "odometry_up"),
     "swarm": ("live", "live_steps", "held_joins", "cameras"),
     "machine": ("installation", "network_check"),
 }

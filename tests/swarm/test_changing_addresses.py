@@ -60,10 +60,11 @@ async def test_robots_with_addresses_of_their_link_meet_and_again_once_they_get_
             host.get_address(number, "169.254.7", 16)
         async with running(tmp_path, machines, "auto") as robots:
             await reached(robots, lambda: meet(robots), MEET_S, "both hear each other")
-            for number, host in enumerate(machines, 1):
+            for host in machines:
                 host.lose_address()
-                host.get_address(number)
             await reached(robots, lambda: not meet(robots), MEET_S, "they are apart")
+            for number, host in enumerate(machines, 1):
+                host.get_address(number)
             await reached(robots, lambda: meet(robots), MEET_S, "both hear each other again")
 
 
