@@ -16,7 +16,7 @@ GEOMETRY = Geometry()
 NO_RATIO = float("inf")
 """Eq. (1) alone suffices nowhere: with a poor odometry pair ALIKED's wrong pairs reach 2.7."""
 ACCEPTANCE = {
-    "aliked-lightglue": Acceptance(Needed(200, 120, 0.0087), Needed(NEVER, 120, 0.007), NO_RATIO),
+    "aliked-lightglue": Acceptance(Needed(200, 80, 0.0087), Needed(NEVER, 80, 0.007), NO_RATIO),
     "xfeat-lighterglue": Acceptance(
         Needed(NEVER, 80, 0.0087), Needed(NEVER, 80, 0.007), 0.4, upright=Needed(NEVER, 40, 0.0087)
     ),
