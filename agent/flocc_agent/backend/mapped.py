@@ -259,7 +259,6 @@ def _ties(mapped: Mapped) -> list[LoopClosure]:
             covariance=S,
             metric=True,
             support=JOINS,
-            from_images=False,
         )
         for log in others
     ]

@@ -210,8 +210,9 @@ def _whole(factor: MeasuredFactor) -> LoopClosure:
 
 
 def _closure(factor: MeasuredFactor, T: Float, covariance: Float, support: int) -> LoopClosure:
-    ends = factor.query, factor.match
-    return LoopClosure(*ends, T, CERTAIN_RATIO, covariance=covariance, metric=True, support=support, from_images=False)
+    return LoopClosure(
+        factor.query, factor.match, T, CERTAIN_RATIO, covariance=covariance, metric=True, support=support
+    )
 
 
 # Positions without a rotation

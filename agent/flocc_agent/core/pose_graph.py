@@ -54,7 +54,6 @@ class LoopClosure:
         covariance: (6, 6) of the measurement in its own units, or None for the back end's configured model.
         metric: The translation is in metres and no scale is estimated.
         support: How many closures it counts as where maps are joined; a single one may be wrong.
-        from_images: Registered from two images; else something measured stands for it, or an opened map.
         weight: How much of its information counts: less where what it shows is known to have changed.
         doubt: Why it counts only where others agree with it; else empty.
     """
@@ -67,9 +66,13 @@ class LoopClosure:
     covariance: Float | None = None
     metric: bool = False
     support: int = 1
-    from_images: bool = True
     weight: float = 1.0
     doubt: str = ""
+
+    @property
+    def from_images(self) -> bool:
+        """Whether it was registered from two images; else something measured stands for it, or an opened map."""
+        return self.support == 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,7 +3,7 @@
 import asyncio
 import sys
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import replace
 from typing import Any
@@ -212,19 +212,25 @@ async def test_fixes_are_interpolated_to_the_stamps_of_keyframes() -> None:
     assert agent.problems() == []
 
 
-async def test_what_the_covariance_of_odometry_grew_by_becomes_that_of_the_steps() -> None:
+async def driven_by_hand(way: Iterable[tuple[int, float]]) -> Agent:
+    """What an adapter gives of a camera that was at so many metres at each of some times (ms), without a network."""
     agent = Agent()
     config = Ros2Config(camera_mounting=MOUNTING)
     adapter = Ros2Adapter(config, "r1", KeyframeSelector(KeyframeConfig(distance_m=0.09)), agent.host())
     hearing = adapter._hearing = adapter._heard(config)
     K, P = (5.0, 0, 3.0, 0, 5.0, 2.0, 0, 0, 1), (5.0, 0, 3.0, 0, 0, 5.0, 2.0, 0, 0, 0, 1, 0)
     hearing.take("camera_info", cdr_by_hand.camera_info(stamp(0), "optical", SIZE, K, [0.0] * 5, P))
-    for t_ms in range(0, 400, 100):
-        sample = Stamped(stamp(t_ms), "odom", "base_link", (1e-3 * t_ms, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    for t_ms, x_m in way:
+        sample = Stamped(stamp(t_ms), "odom", "base_link", (x_m, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         hearing.take("odometry", cdr_by_hand.odometry(sample, variance=1e-6 * t_ms))
         hearing.take("image", cdr_by_hand.image(stamp(t_ms), "optical", SIZE, "mono8", bytes(24), 6))
         while (posed := hearing.next_wanted(adapter._selector)) is not None:
             await adapter._add(hearing, posed)
+    return agent
+
+
+async def test_what_the_covariance_of_odometry_grew_by_becomes_that_of_the_steps() -> None:
+    agent = await driven_by_hand((t_ms, 1e-3 * t_ms) for t_ms in range(0, 400, 100))
     assert len(agent.keyframes) == 4
     assert [round(1000 * (stamp_s - EPOCH_S)) for _, stamp_s in agent.measured] == [100, 200, 300]
     for measured, _ in agent.measured:
@@ -234,19 +240,9 @@ async def test_what_the_covariance_of_odometry_grew_by_becomes_that_of_the_steps
 
 
 async def test_a_step_over_a_pause_of_odometry_is_left_to_closures_whatever_its_covariance_says() -> None:
-    agent = Agent()
-    config = Ros2Config(camera_mounting=MOUNTING)
-    adapter = Ros2Adapter(config, "r1", KeyframeSelector(KeyframeConfig(distance_m=0.09)), agent.host())
-    hearing = adapter._hearing = adapter._heard(config)
-    K, P = (5.0, 0, 3.0, 0, 5.0, 2.0, 0, 0, 1), (5.0, 0, 3.0, 0, 0, 5.0, 2.0, 0, 0, 0, 1, 0)
-    hearing.take("camera_info", cdr_by_hand.camera_info(stamp(0), "optical", SIZE, K, [0.0] * 5, P))
-    for t_ms in [*range(0, 1200, 100), *range(21_200, 21_500, 100)]:
-        x_m = 1e-3 * t_ms if t_ms < 20_000 else 1e-3 * (t_ms - 20_000)
-        sample = Stamped(stamp(t_ms), "odom", "base_link", (x_m, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-        hearing.take("odometry", cdr_by_hand.odometry(sample, variance=1e-6 * t_ms))
-        hearing.take("image", cdr_by_hand.image(stamp(t_ms), "optical", SIZE, "mono8", bytes(24), 6))
-        while (posed := hearing.next_wanted(adapter._selector)) is not None:
-            await adapter._add(hearing, posed)
+    before, after = range(0, 1200, 100), range(21_200, 21_500, 100)
+    way = [*((t_ms, 1e-3 * t_ms) for t_ms in before), *((t_ms, 1e-3 * (t_ms - 20_000)) for t_ms in after)]
+    agent = await driven_by_hand(way)
     wide = {round(1000 * (stamp_s - EPOCH_S)): m.covariance[0, 0] for m, stamp_s in agent.measured}  # type: ignore[union-attr]
     assert [t_ms for t_ms, variance in wide.items() if variance > 1.0] == [21_200]
 
